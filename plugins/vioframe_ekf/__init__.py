@@ -1,0 +1,1 @@
+"""Loosely coupled error-state Kalman filter."""

@@ -1,0 +1,1 @@
+"""Visual odometry from geometry: two-view, local map, stereo."""

@@ -1,0 +1,1 @@
+"""Shi-Tomasi corners followed by pyramidal Lucas–Kanade."""

@@ -1,0 +1,1 @@
+"""Loosely coupled multi-sensor filter: scale, vision-frame drift, delayed measurements."""

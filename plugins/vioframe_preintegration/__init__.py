@@ -1,0 +1,1 @@
+"""Inertial integrators: on-manifold preintegration, strapdown, and the printed form of EE-LCVIO."""

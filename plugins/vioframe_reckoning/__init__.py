@@ -1,0 +1,1 @@
+"""Fusers that use one sensor alone: IMU-only dead reckoning and VO-only."""

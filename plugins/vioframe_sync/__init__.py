@@ -1,0 +1,1 @@
+"""Synchronizers: pair each image with the inertial samples since the one before."""

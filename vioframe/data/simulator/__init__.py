@@ -1,0 +1,1 @@
+"""The built-in simulated recording: exact motion, IMU and rendered images."""

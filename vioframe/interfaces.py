@@ -1,0 +1,178 @@
+"""The five interfaces, and the names of what they exchange.
+
+A component says what it ``requires`` of the parts before it and what it ``provides`` to those after it;
+the names are plain strings, so that a stranger's front end may provide ``"depth"`` and a stranger's fuser
+require it with no change here.
+"""
+
+import inspect
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+from vioframe.checks import Array
+from vioframe.errors import ConfigError, PluginError
+from vioframe.types import (
+    Frame,
+    ImuBias,
+    ImuBlock,
+    InertialDelta,
+    Measurement,
+    NavState,
+    Packet,
+    RelativePose,
+    SensorRig,
+    SyncedWindow,
+    Trajectory,
+    VisualFeatures,
+)
+
+TRACKS, FLOW, EMBEDDING = "tracks", "flow", "embedding"
+"""Fields of :class:`VisualFeatures`."""
+IMAGES = "images"
+"""Pixels in ``Frame.images``; provided by a recording whose rig has cameras."""
+STEREO = "stereo"
+"""A second, overlapping camera; provided by a recording whose rig has two."""
+RELATIVE_POSE = "relative_pose"
+"""``Measurement.relative_pose``."""
+CONSISTENT_SCALE, METRIC_SCALE = "consistent_scale", "metric_scale"
+"""The translation of the relative pose keeps one unit through the sequence / is in metres (which keeps one too)."""
+INERTIAL_DELTA = "inertial_delta"
+"""``Measurement.inertial_delta``."""
+
+
+class Component(ABC):
+    """What all parts share: they are set up once a sequence and say what they need and give."""
+
+    requires: ClassVar[frozenset[str]] = frozenset()
+    provides: ClassVar[frozenset[str]] = frozenset()
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        for name, method in vars(cls).items():
+            if not inspect.isfunction(method) or name.startswith("_"):
+                continue
+            inherited = next((getattr(base, name) for base in cls.__mro__[1:] if name in vars(base)), None)
+            if inspect.isfunction(inherited):
+                _check_override(cls, name, method, inherited)
+
+    def setup(self, rig: SensorRig) -> None:
+        """Forget the last sequence and take the next one's calibration."""
+
+    def counters(self) -> Mapping[str, int]:
+        """What happened since ``setup`` that a user should read in the table, such as ``{"dropped frames": 3}``."""
+        return {}
+
+
+def _check_override(cls: type, name: str, method: Any, inherited: Any) -> None:
+    """Compare an overriding method's parameters with the interface's, when the class is made."""
+    wanted = list(inspect.signature(inherited).parameters.values())
+    given = list(inspect.signature(method).parameters.values())
+    same = len(given) >= len(wanted) and all(
+        mine.name == theirs.name for mine, theirs in zip(given, wanted, strict=False)
+    )
+    needless = [p.name for p in given[len(wanted) :] if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    missing_default = [
+        mine.name
+        for mine, theirs in zip(given, wanted, strict=False)
+        if theirs.default is not theirs.empty and mine.default is mine.empty
+    ]
+    if not same or needless or missing_default:
+        raise PluginError(
+            f"{cls.__module__}.{cls.__qualname__}.{name} must take the parameters "
+            f"{inspect.signature(inherited)}, but takes {inspect.signature(method)}"
+        )
+
+
+class Synchronizer(Component):
+    """Pairs each image with the inertial samples since the one before, on the IMU clock."""
+
+    @abstractmethod
+    def push(self, packet: Packet) -> list[SyncedWindow]:
+        """Take one packet; return the windows it completes, oldest first."""
+
+    @abstractmethod
+    def flush(self) -> list[SyncedWindow]:
+        """The recording has ended: return what can still be completed."""
+
+
+class Frontend(Component):
+    """Turns an image into what a motion estimator can use."""
+
+    requires: ClassVar[frozenset[str]] = frozenset({IMAGES})
+
+    @abstractmethod
+    def process(self, frame: Frame, R_prev_cur: Array | None = None) -> VisualFeatures:
+        """Process the next image.
+
+        Args:
+            frame: on the IMU clock.
+            R_prev_cur: (3, 3) rotation of the *body* since the image before, predicted by the gyro, when known.
+        """
+
+    def process_many(self, frames: Iterable[Frame]) -> list[VisualFeatures]:
+        """Process images in a row; a network overrides this with one batched pass."""
+        return [self.process(frame) for frame in frames]
+
+
+class VOEstimator(Component):
+    """Estimates the motion of the camera between two images."""
+
+    provides: ClassVar[frozenset[str]] = frozenset({RELATIVE_POSE})
+
+    @abstractmethod
+    def estimate(self, previous: VisualFeatures, current: VisualFeatures) -> RelativePose:
+        """Motion of camera 0 from ``previous`` to ``current``; ``valid=False`` rather than an exception."""
+
+
+class InertialIntegrator(Component):
+    """Turns inertial samples into one motion increment; keeps no state but the calibration."""
+
+    provides: ClassVar[frozenset[str]] = frozenset({INERTIAL_DELTA})
+
+    @abstractmethod
+    def integrate(self, imu: ImuBlock, bias: ImuBias) -> InertialDelta:
+        """Integrate from the first to the last sample of ``imu``, subtracting ``bias``."""
+
+
+class Fuser(Component):
+    """Turns measurements into the state of the body."""
+
+    @abstractmethod
+    def update(self, measurement: Measurement) -> list[NavState]:
+        """Take the next window; return new states, oldest first, each stamp once."""
+
+    def flush(self) -> list[NavState]:
+        """The recording has ended: return the states not yet given."""
+        return []
+
+    def start_from(self, state: NavState) -> None:
+        """Start from a given state at ``window.previous`` of the next update, instead of initialising.
+
+        Raises:
+            ConfigError: this method initialises itself only.
+        """
+        raise ConfigError(
+            f"init=groundtruth: {type(self).__name__} cannot start from a given state; use init=rest"
+        )
+
+    def bias(self) -> ImuBias:
+        """What the integrator should assume next."""
+        return ImuBias()
+
+    def smoothed(self) -> Trajectory | None:
+        """The final trajectory (``causal=False``), where the method has one."""
+        return None
+
+
+@runtime_checkable
+class UsesGroundTruth(Protocol):
+    """A component that simulates a sensor from the truth, such as ``vo=simulated``.
+
+    The experiment hands it the truth openly and writes the component's name into the protocol of every
+    number it prints; no other component ever sees the truth.
+    """
+
+    def take_ground_truth(self, trajectory: Trajectory) -> None:
+        """Receive the true trajectory, after ``setup`` and before the first packet."""
+        ...
