@@ -1,0 +1,90 @@
+"""What an experiment hands to the evaluation: the record of one sequence, finished or not."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from vioframe.checks import Array, Stamps, check_array, check_increasing
+from vioframe.types import Image, NavState, Trajectory
+
+RunStatus = Literal["finished", "failed", "interrupted"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SampleFrame:
+    """An image kept for the report, with the tracks that the front end had on it.
+
+    Attributes:
+        stamp_ns: IMU clock.
+        image: (H, W) or (H, W, 3) uint8.
+        pixels: (M, 2) px, x right, y down; empty where the system follows no points.
+        ids: (M,) int64, lasting.
+    """
+
+    stamp_ns: int
+    image: Image
+    pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    ids: Stamps = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        check_array("SampleFrame.ids", self.ids, (None,), np.int64)
+        check_array("SampleFrame.pixels", self.pixels, (len(self.ids), 2))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SequenceRun:
+    """One sequence, run through a pipeline.
+
+    Attributes:
+        sequence: name, also used for folders.
+        states: what the fuser gave while it ran, of every status, oldest first, each stamp once.
+        smoothed: the final trajectory (``causal=False``), where the fuser has one.
+        ground_truth: where the recording has one, on the IMU clock.
+        frames_expected: images of the recording, the first included.
+        duration_s: length of the recording.
+        pipeline_s: wall seconds inside the pipeline.
+        parts_s: of these, the seconds inside each part's own methods.
+        windows: pairs of images that were processed.
+        wall_s: wall seconds from opening the recording to its end, reading and rendering included.
+        counters: what happened that a user should know, such as ``{"dropped frames": 3}``.
+        track_stamps_ns: (K,) and track_counts (K,): number of points followed; empty without a front end.
+        sample_frames: a few images for the report.
+        init: how the fuser was started, ``"rest"`` or ``"groundtruth"``.
+        uses_ground_truth: names of the parts that simulate a sensor from the truth.
+        error: what went wrong, in one sentence, or None.
+        interrupted: the user stopped the run; ``error`` may say at which stamp.
+    """
+
+    sequence: str
+    states: Sequence[NavState]
+    smoothed: Trajectory | None = None
+    ground_truth: Trajectory | None = None
+    frames_expected: int
+    duration_s: float
+    pipeline_s: float
+    parts_s: Mapping[str, float] = field(default_factory=dict)
+    windows: int
+    wall_s: float
+    counters: Mapping[str, int] = field(default_factory=dict)
+    track_stamps_ns: Stamps = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    track_counts: Stamps = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    sample_frames: Sequence[SampleFrame] = ()
+    init: str = "rest"
+    uses_ground_truth: tuple[str, ...] = ()
+    error: str | None = None
+    interrupted: bool = False
+
+    def __post_init__(self) -> None:
+        check_array("SequenceRun.track_stamps_ns", self.track_stamps_ns, (None,), np.int64)
+        check_array("SequenceRun.track_counts", self.track_counts, (len(self.track_stamps_ns),), np.int64)
+        stamps = np.array([state.stamp_ns for state in self.states], dtype=np.int64)
+        check_increasing("SequenceRun.states", stamps)
+
+    @property
+    def status(self) -> RunStatus:
+        """How the sequence ended."""
+        if self.interrupted:
+            return "interrupted"
+        return "finished" if self.error is None else "failed"
