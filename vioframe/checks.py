@@ -73,9 +73,7 @@ def check_pose(field: str, T: object, *, tolerance: float = 1e-6) -> None:
     rotation = T[..., :3, :3]
     deviation = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3))
     if deviation.size and deviation.max() > tolerance:
-        raise ShapeError(
-            f"{field} must be a rigid motion, but R Rᵀ is off the identity by {deviation.max():.2g}"
-        )
+        raise ShapeError(f"{field} must be a rigid motion, but R Rᵀ is off the identity by {deviation.max():.2g}")
     if rotation.size and (np.linalg.det(rotation) < 0).any():
         raise ShapeError(f"{field} must be a rotation, but its determinant is negative: a mirrored axis")
     if T.size and np.abs(T[..., 3, :] - (0.0, 0.0, 0.0, 1.0)).max() > tolerance:

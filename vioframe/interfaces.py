@@ -56,7 +56,7 @@ class Component(ABC):
             if inspect.isfunction(inherited):
                 _check_override(cls, name, method, inherited)
 
-    def setup(self, rig: SensorRig) -> None:
+    def setup(self, rig: SensorRig) -> None:  # noqa: B027 - a part without calibration needs none of its own
         """Forget the last sequence and take the next one's calibration."""
 
     def counters(self) -> Mapping[str, int]:
@@ -71,7 +71,8 @@ def _check_override(cls: type, name: str, method: Any, inherited: Any) -> None:
     same = len(given) >= len(wanted) and all(
         mine.name == theirs.name for mine, theirs in zip(given, wanted, strict=False)
     )
-    needless = [p.name for p in given[len(wanted) :] if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    needless = [p.name for p in given[len(wanted) :] if p.default is p.empty and p.kind not in variadic]
     missing_default = [
         mine.name
         for mine, theirs in zip(given, wanted, strict=False)
@@ -152,9 +153,7 @@ class Fuser(Component):
         Raises:
             ConfigError: this method initialises itself only.
         """
-        raise ConfigError(
-            f"init=groundtruth: {type(self).__name__} cannot start from a given state; use init=rest"
-        )
+        raise ConfigError(f"init=groundtruth: {type(self).__name__} cannot start from a given state; use init=rest")
 
     def bias(self) -> ImuBias:
         """What the integrator should assume next."""

@@ -165,9 +165,7 @@ class Pipeline:
         delta = self._integrate(window)
         features = self._see(window, delta)
         relative_pose = self._estimate(features)
-        measurement = Measurement(
-            window=window, features=features, relative_pose=relative_pose, inertial_delta=delta
-        )
+        measurement = Measurement(window=window, features=features, relative_pose=relative_pose, inertial_delta=delta)
         started = time.perf_counter()
         states = self.fuser.update(measurement)
         self.timers["fuser"].add(started)
@@ -243,13 +241,13 @@ def check_rig(parts: Mapping[str, Component], rig: SensorRig, choices: Mapping[s
     Raises:
         WiringError: names the part and the number of cameras it has and needs.
     """
+    available = len(rig.cameras) if rig.has_images else 0
     for slot, part in parts.items():
         needed = 2 if STEREO in part.requires else 1 if IMAGES in part.requires else 0
-        if len(rig.cameras) < needed:
+        if available < needed:
             name = choices.get(slot, type(part).__name__)
             raise WiringError(
-                f"{slot}={name} needs {needed} camera{'s' * (needed > 1)}, but the recording has "
-                f"{len(rig.cameras)}: choose another {slot}, or a recording (dataset.*) with more cameras"
+                f"{slot}={name} needs the images of {needed} camera{'s' * (needed > 1)}, but the recording gives "
+                f"{available}: choose another {slot}, or rig={'stereo' if needed > 1 else 'mono'} where the "
+                "recording has them"
             )
-
-

@@ -151,7 +151,8 @@ class SensorRig:
     """The calibration a component is set up with.
 
     Attributes:
-        cameras: in the order of ``Frame.images``; empty where a recording has no images.
+        cameras: in the order of ``Frame.images``; empty where a recording has none.
+        has_images: False where the frames carry stamps only, though the cameras' calibration is known.
         imu: noise densities.
         gravity: magnitude, m/s².
         camera_delay_ns: ``t_imu = t_cam + camera_delay_ns``.
@@ -161,6 +162,7 @@ class SensorRig:
     imu: ImuNoise
     gravity: float = 9.81
     camera_delay_ns: int = 0
+    has_images: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
