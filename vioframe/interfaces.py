@@ -41,7 +41,7 @@ INERTIAL_DELTA = "inertial_delta"
 """``Measurement.inertial_delta``."""
 
 
-class Component(ABC):
+class Component(ABC):  # noqa: B024 - the five below have the abstract methods
     """What all parts share: they are set up once a sequence and say what they need and give."""
 
     requires: ClassVar[frozenset[str]] = frozenset()

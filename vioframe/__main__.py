@@ -1,0 +1,80 @@
+"""``python -m vioframe``: compose the config, dispatch on ``task``, fail in one sentence.
+
+Nothing heavy is imported here: ``--help``, a misspelt option and ``task=plugins`` answer at once.
+"""
+
+import importlib
+import logging
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vioframe.errors import ConfigError, VioframeError
+from vioframe.plugins import core_conf, extend_hydra
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+log = logging.getLogger("vioframe")
+
+TASKS = ("experiment", "evaluate", "doctor", "matrix", "plugins")
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells have it: 128 + SIGINT."""
+
+
+def dispatch(config: "DictConfig") -> int:
+    """Run the task the config names; return the exit status."""
+    name = config.task.name
+    if name not in TASKS:
+        raise ConfigError(f"task.name={name} is unknown: choose one of {', '.join(TASKS)}")
+    run: Callable[[DictConfig], int] = importlib.import_module(f"vioframe.tasks.{name}").run
+    return run(config)
+
+
+def run_job(config: "DictConfig") -> None:
+    """One job of Hydra's: a user's mistake becomes one sentence and a non-zero exit status."""
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    try:
+        status = dispatch(config)
+    except VioframeError as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        log.error("%s", error)
+        status = 1
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            record_failure(Path(HydraConfig.get().runtime.output_dir), str(error))
+    # In a multirun the others go on; main() reads what became of each from its folder.
+    if status and HydraConfig.get().mode != RunMode.MULTIRUN:
+        sys.exit(status)
+
+
+def record_failure(folder: Path, message: str) -> None:
+    """Leave word of a job that failed before it could write its own status."""
+    import json
+
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "status.json"
+    if not path.exists():
+        path.write_text(json.dumps({"status": "failed", "error": message}, indent=2) + "\n", encoding="utf-8")
+
+
+def main() -> None:
+    """Entry point of ``python -m vioframe`` and of the console script."""
+    try:
+        extend_hydra()
+    except VioframeError as error:
+        logging.basicConfig(format="%(levelname)s: %(message)s")
+        log.error("%s", error)
+        sys.exit(1)
+
+    import hydra
+
+    hydra.main(version_base="1.3", config_path=str(core_conf()), config_name="config")(run_job)()
+
+
+if __name__ == "__main__":
+    main()
