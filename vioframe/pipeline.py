@@ -104,6 +104,10 @@ class Pipeline:
         """Call ``observer(measurement, new_states)`` after every window; its time counts to no part."""
         self._observers.append(observer)
 
+    def forget(self, observer: Observer) -> None:
+        """Stop calling an observer."""
+        self._observers.remove(observer)
+
     def setup(self, rig: SensorRig, initial_state: InitialState | None = None) -> None:
         """Forget the last sequence and take the next one's calibration.
 

@@ -93,9 +93,7 @@ def _without_repeats(table: Table) -> Table:
         "%s: %d of %d rows repeat the stamp before them and are left out, the first at line %d",
         table.path, dropped, len(table), table.lines[first],
     )  # fmt: skip
-    return replace(
-        table, first=[table.first[row] for row in kept], values=table.values[kept], lines=table.lines[kept]
-    )
+    return replace(table, first=[table.first[row] for row in kept], values=table.values[kept], lines=table.lines[kept])
 
 
 def detect_format(table: Table) -> TrajectoryFormat:
@@ -121,14 +119,15 @@ def detect_format(table: Table) -> TrajectoryFormat:
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
     """Write ``stamp_s x y z qx qy qz qw``: stamps exact, the rest to 12 decimals."""
-    quat_wxyz = quaternion.from_matrix(trajectory.T_world_body[:, :3, :3])
-    values = np.hstack([trajectory.T_world_body[:, :3, 3], quat_wxyz[:, 1:], quat_wxyz[:, :1]])
     lines = [f"# {_kind(trajectory)}", "# stamp_s x y z qx qy qz qw"]
-    lines += [
-        f"{format_seconds(int(stamp))} {_numbers(row, ' ')}"
-        for stamp, row in zip(trajectory.stamps_ns, values, strict=True)
-    ]
-    _write(path, lines)
+    _write(path, lines + tum_lines(trajectory.stamps_ns, trajectory.T_world_body))
+
+
+def tum_lines(stamps_ns: Stamps, T_world_body: Array) -> list[str]:
+    """One line a pose, (N,) stamps and (N, 4, 4) poses, for a file that grows while a run lasts."""
+    quat_wxyz = quaternion.from_matrix(T_world_body[:, :3, :3])
+    values = np.hstack([T_world_body[:, :3, 3], quat_wxyz[:, 1:], quat_wxyz[:, :1]])
+    return [f"{format_seconds(int(stamp))} {_numbers(row, ' ')}" for stamp, row in zip(stamps_ns, values, strict=True)]
 
 
 def write_euroc(path: Path | str, trajectory: Trajectory) -> None:
