@@ -1,0 +1,316 @@
+"""One sequence, one row: every metric by name, and the reason wherever there is none."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+
+from vioframe.conventions import NANOSECONDS
+from vioframe.errors import MetricError
+from vioframe.evaluation import metrics
+from vioframe.evaluation.align import Alignment, MatchedPoses, Motion, associate, path_length
+from vioframe.evaluation.protocol import EvaluationOptions, Output, Protocol, describe_options
+from vioframe.evaluation.run import SequenceRun
+from vioframe.types import NavState, Trajectory
+
+Row = dict[str, object]
+"""One entry of ``metrics.json``: plain values only."""
+
+FARTHEST_M = 1e9
+"""A position beyond this has nothing to do with the recording, and its square would swamp every sum."""
+
+NO_TRUTH = "the recording has no ground truth"
+
+
+class _Cells:
+    """Metrics of one trajectory as they are found, and the reasons of those that are not."""
+
+    def __init__(self) -> None:
+        self.values: Row = {}
+        self.undefined: dict[str, str] = {}
+
+    def add(self, names: Sequence[str], compute: Callable[[], Sequence[float]]) -> None:
+        """Add what ``compute`` returns, in order; where it refuses, each is None for that reason."""
+        try:
+            values = [float(value) for value in compute()]
+        except MetricError as error:
+            self.refuse(names, str(error))
+            return
+        for name, value in zip(names, values, strict=True):
+            if math.isfinite(value):
+                self.values[name] = value
+            else:
+                self.refuse([name], f"the value is {value}: the estimate has diverged beyond what can be computed")
+
+    def refuse(self, names: Sequence[str], reason: str) -> None:
+        """Mark metrics as undefined."""
+        for name in names:
+            self.values[name] = None
+            self.undefined[name] = reason
+
+
+def evaluate_run(run: SequenceRun, options: EvaluationOptions | None = None) -> Row:
+    """Compute one entry of ``metrics.json``.
+
+    Args:
+        run: finished or not; what is there is evaluated.
+        options: the default protocol if None.
+
+    Returns:
+        Plain numbers, strings, lists and dicts. A metric that is not defined is None, with its reason in
+        ``undefined``; no value is NaN or infinite.
+    """
+    options = options or EvaluationOptions()
+    states = evaluated_states(run)
+    tracking = sum(state.status == "tracking" for state in run.states)
+    row: Row = {"sequence": run.sequence, "status": run.status, "error": run.error}
+    cells = _accuracy(Trajectory.from_states(states), run.ground_truth, options)
+    _add_consistency(cells, states, run, options)
+    windows_expected = max(run.frames_expected - 1, 0)
+
+    def completion() -> list[float]:
+        if windows_expected == 0:
+            raise MetricError(f"the recording has {run.frames_expected} frames, and a window needs two")
+        return [min(tracking / windows_expected, 1.0)]
+
+    cells.add(["completion"], completion)
+    cells.add(["real_time_factor"], lambda: [_real_time_factor(run)])
+    row |= cells.values
+    row["ms_per_frame"] = milliseconds_per_frame(run)
+    row |= {
+        "frames": run.frames_expected,
+        "windows": run.windows,
+        "states": {
+            status: sum(state.status == status for state in run.states) for status in ("starting", "tracking", "lost")
+        },
+        "duration_s": run.duration_s,
+        "pipeline_s": run.pipeline_s,
+        "wall_s": run.wall_s,
+        "counters": {name: int(count) for name, count in run.counters.items()},
+        "undefined": cells.undefined,
+        "protocol": make_protocol(run, options, "causal").as_dict(),
+        "final": None,
+    }
+    if run.smoothed is not None:
+        final = _accuracy(run.smoothed, run.ground_truth, options)
+        row["final"] = {
+            **final.values,
+            "undefined": final.undefined,
+            "protocol": make_protocol(run, options, "final").as_dict(),
+        }
+    return row
+
+
+def evaluated_states(run: SequenceRun) -> list[NavState]:
+    """The states that are compared, drawn and written to disk: all from after the initialisation."""
+    return [state for state in run.states if state.status != "starting"]
+
+
+def make_protocol(run: SequenceRun, options: EvaluationOptions, output: Output) -> Protocol:
+    """How the numbers of this sequence are measured."""
+    if output == "causal":
+        stamps_ns = np.array([state.stamp_ns for state in evaluated_states(run)], dtype=np.int64)
+    else:
+        stamps_ns = np.zeros(0, dtype=np.int64) if run.smoothed is None else run.smoothed.stamps_ns
+    return Protocol(
+        options=options,
+        output=output,
+        rate_hz=rate_hz(stamps_ns),
+        truth_rate_hz=None if run.ground_truth is None else rate_hz(run.ground_truth.stamps_ns),
+        init=run.init,
+        uses_ground_truth=run.uses_ground_truth,
+        nees_alignment="none" if run.init == "groundtruth" else "yaw and position at the first tracking state",
+    )
+
+
+def rate_hz(stamps_ns: np.ndarray) -> float | None:
+    """Usual rate of stamps, or None for fewer than two."""
+    return NANOSECONDS / float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else None
+
+
+def match_run(run: SequenceRun, options: EvaluationOptions) -> MatchedPoses:
+    """Poses of :func:`evaluated_states` with their truth.
+
+    Raises:
+        MetricError: there is no truth, or none at these stamps.
+    """
+    states = evaluated_states(run)
+    return match(Trajectory.from_states(states), run.ground_truth, options)
+
+
+def match(estimate: Trajectory, truth: Trajectory | None, options: EvaluationOptions) -> MatchedPoses:
+    """:func:`~vioframe.evaluation.align.associate` with the user's options.
+
+    Raises:
+        MetricError: there is no truth, or none at these stamps.
+    """
+    if truth is None:
+        raise MetricError(NO_TRUTH)
+    if len(estimate) == 0:
+        raise MetricError("no state with status tracking or lost: the system never started")
+    farthest = float(np.abs(estimate.T_world_body[:, :3, 3]).max())
+    if farthest > FARTHEST_M:
+        raise MetricError(f"the estimate has diverged: a position is {farthest:.2g} m from the origin")
+    return associate(
+        estimate,
+        truth,
+        method=options.association,
+        max_gap_s=options.max_gap_s,
+        max_difference_s=options.max_difference_s,
+    )
+
+
+def _accuracy(estimate: Trajectory, truth: Trajectory | None, options: EvaluationOptions) -> _Cells:
+    """Every metric that two trajectories suffice for."""
+    cells = _Cells()
+    reason, matched = "", None
+    try:
+        matched = match(estimate, truth, options)
+    except MetricError as error:
+        reason = str(error)
+
+    def add(names: Sequence[str], compute: Callable[[MatchedPoses], Sequence[float]]) -> None:
+        if matched is None:
+            cells.refuse(names, reason)
+        else:
+            cells.add(names, lambda: compute(matched))
+
+    cells.add(["path_estimated_m"], lambda: [path_length(estimate.T_world_body)])
+    cells.values["poses"] = 0 if matched is None else len(matched)
+    add(["path_m"], lambda m: [m.path_m])
+    add(["ate_se3_m", "ate_se3_mean_m", "ate_se3_median_m", "ate_se3_max_m"], lambda m: _statistics(m, "se3"))
+    add(["ate_se3_percent"], _ate_percent)
+    add(["ate_yaw_m"], lambda m: [metrics.absolute_error(m, "yaw")[0].rmse])
+    add(["ate_sim3_m", "sim3_scale"], _sim3)
+    add(["scale_error_percent"], lambda m: [metrics.scale_error_percent(_sim3(m)[1])])
+    for distance in options.rpe_distances_m:
+        add(
+            [f"rpe_trans_percent_{distance:g}m", f"rpe_rot_deg_{distance:g}m"],
+            partial(_rpe_by_distance, distance_m=distance),
+        )
+    for duration in options.rpe_times_s:
+        add(
+            [f"rpe_trans_m_{duration:g}s", f"rpe_rot_deg_{duration:g}s"],
+            partial(_rpe_by_time, duration_s=duration),
+        )
+    add(["t_rel_percent", "r_rel_deg_per_100m"], lambda m: _segments(m, options))
+    add(["yaw_rmse_deg"], lambda m: [_rms_deg(metrics.yaw_errors(m))])
+    add(["gravity_rmse_deg", "gravity_max_deg"], _gravity)
+    cells.values["segments"] = {}
+    if matched is not None and cells.values["t_rel_percent"] is not None:
+        errors = metrics.segment_errors(matched, options.segment_lengths_m, options.segment_step)
+        cells.values["segments"] = errors.by_length()
+    return cells
+
+
+def _statistics(matched: MatchedPoses, alignment: Alignment) -> list[float]:
+    error = metrics.absolute_error(matched, alignment)[0]
+    return [error.rmse, error.mean, error.median, error.maximum]
+
+
+def _ate_percent(matched: MatchedPoses) -> list[float]:
+    path_m = matched.path_m
+    if path_m < 1.0:
+        raise MetricError(f"the path is {path_m:.2g} m long: a percentage of it would say nothing")
+    return [100.0 * metrics.absolute_error(matched, "se3")[0].rmse / path_m]
+
+
+def _sim3(matched: MatchedPoses) -> list[float]:
+    error, motion = metrics.absolute_error(matched, "sim3")
+    return [error.rmse, motion.scale]
+
+
+def _rpe_by_distance(matched: MatchedPoses, distance_m: float) -> list[float]:
+    error = metrics.relative_error_by_distance(matched, distance_m)
+    return [error.trans_percent or 0.0, error.rot_deg]
+
+
+def _rpe_by_time(matched: MatchedPoses, duration_s: float) -> list[float]:
+    error = metrics.relative_error_by_time(matched, duration_s)
+    return [error.trans_m, error.rot_deg]
+
+
+def _segments(matched: MatchedPoses, options: EvaluationOptions) -> list[float]:
+    errors = metrics.segment_errors(matched, options.segment_lengths_m, options.segment_step)
+    return [errors.t_rel_percent, errors.r_rel_deg_per_100m]
+
+
+def _gravity(matched: MatchedPoses) -> list[float]:
+    errors = metrics.gravity_errors(matched)
+    return [_rms_deg(errors), float(np.rad2deg(errors.max()))]
+
+
+def _rms_deg(radians: np.ndarray) -> float:
+    return float(np.rad2deg(np.sqrt(np.mean(radians**2))))
+
+
+def _add_consistency(cells: _Cells, states: Sequence[NavState], run: SequenceRun, options: EvaluationOptions) -> None:
+    names = ["anees_position", "anees_orientation", "anees_pose"]
+    if all(state.covariance is None for state in states):
+        cells.refuse(names, "the fuser gives no covariance" if states else "there is no state")
+        return
+    try:
+        matched = match_run(run, options)
+        motion = metrics.initial_alignment(matched, states, run.init)
+        errors = tracking_errors(matched, states, motion, run.init)
+    except MetricError as error:
+        cells.refuse(names, str(error))
+        return
+    position = metrics.normalised_errors(errors.position, errors.covariance[:, 3:, 3:])
+    orientation = metrics.normalised_errors(errors.theta, errors.covariance[:, :3, :3])
+    pose = metrics.normalised_errors(np.concatenate([errors.theta, errors.position], axis=1), errors.covariance)
+    cells.add(names[:1], lambda: [metrics.average_nees(position, 3)])
+    cells.add(names[1:2], lambda: [metrics.average_nees(orientation, 3)])
+    cells.add(names[2:], lambda: [metrics.average_nees(pose, 6)])
+
+
+def tracking_errors(
+    matched: MatchedPoses, states: Sequence[NavState], motion: Motion, init: str
+) -> metrics.StateErrors:
+    """Errors of the states with status tracking, but for the one that was made to meet the truth."""
+    errors = metrics.state_errors(matched, states, motion)
+    tracking = np.array(
+        [states[matched.estimate_index[pose]].status == "tracking" for pose in errors.index], dtype=bool
+    )
+    if init != "groundtruth" and tracking.any():
+        tracking[int(np.argmax(tracking))] = False
+    return metrics.StateErrors(
+        index=errors.index[tracking],
+        theta=errors.theta[tracking],
+        position=errors.position[tracking],
+        covariance=errors.covariance[tracking],
+    )
+
+
+def _real_time_factor(run: SequenceRun) -> float:
+    if run.pipeline_s <= 0.0 or run.windows == 0:
+        raise MetricError("no window was processed")
+    processed = 1.0
+    if run.status != "finished":
+        processed = min(run.windows / max(run.frames_expected - 1, 1), 1.0)
+    return processed * run.duration_s / run.pipeline_s
+
+
+def milliseconds_per_frame(run: SequenceRun) -> dict[str, float] | None:
+    """Wall milliseconds a window by part, ``framework`` (outside the parts' own methods) and ``total``."""
+    if run.windows == 0:
+        return None
+    per_window = 1e3 / run.windows
+    table = {part: seconds * per_window for part, seconds in run.parts_s.items()}
+    table["framework"] = max(run.pipeline_s - sum(run.parts_s.values()), 0.0) * per_window
+    table["total"] = run.pipeline_s * per_window
+    return table
+
+
+def metrics_document(
+    rows: Sequence[Row], options: EvaluationOptions, extra: Mapping[str, object] | None = None
+) -> dict[str, object]:
+    """What ``metrics.json`` holds: an interface others script against.
+
+    Args:
+        rows: one per sequence.
+        options: what all rows share.
+        extra: further top-level entries, such as the choice of parts and the version.
+    """
+    return {"sequences": list(rows), "protocol": describe_options(options), **(extra or {})}
