@@ -34,7 +34,7 @@ class StateLog(Sequence[NavState]):
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - lives as long as the log
+        self._file = tempfile.TemporaryFile(dir=folder)
         self._count = 0
 
     def append(self, state: NavState) -> None:
