@@ -1,0 +1,135 @@
+"""Shi-Tomasi corners, spread over the image and away from points already followed."""
+
+import cv2
+import numpy as np
+from vioframe.checks import Array
+
+# OpenCV's cornerMinEigenVal (3×3 Sobel, image in [0, 1]) returns four times the smaller eigenvalue of the mean
+# of ∇I∇Iᵀ over the block, measured against finite differences.
+_EIGENVALUE_UNIT = 4.0
+_BLOCK = 3
+_CELLS = (8, 5)
+_CANDIDATES = 400
+
+
+class CornerDetector:
+    """Finds new corners.
+
+    Args:
+        min_distance_px: between any two points.
+        quality: fraction of the strongest corner's eigenvalue.
+        min_gradient: square root of the smaller eigenvalue, grey levels a pixel.
+        scale: 1, or 2 to look in the half-size image.
+        allowed: (H, W) uint8, zero where no corner may be taken.
+    """
+
+    def __init__(
+        self, *, min_distance_px: float, quality: float, min_gradient: float, scale: int, allowed: np.ndarray
+    ) -> None:
+        self._distance = min_distance_px / scale
+        self._quality = quality
+        self._floor = (min_gradient / 255.0) ** 2
+        self._scale = scale
+        self._allowed = allowed[::scale, ::scale] > 0
+
+    def detect(self, gray: np.ndarray, taken: Array, count: int) -> Array:
+        """Return up to ``count`` corners (K, 2) px, away from the points ``taken`` (M, 2) px.
+
+        Args:
+            gray: (H, W) uint8.
+        """
+        scale = self._scale
+        small = gray if scale == 1 else cv2.resize(gray, self._allowed.shape[::-1], interpolation=cv2.INTER_AREA)
+        strength = cv2.cornerMinEigenVal(small, _BLOCK, ksize=3)
+        # The gradient of the half-size image is twice as steep a pixel.
+        strength *= np.float32(1.0 / (_EIGENVALUE_UNIT * scale**2))
+        peak = float(strength.max())
+        local_maximum = strength >= cv2.dilate(strength, np.ones((3, 3), np.uint8))
+        free = self._free_space(taken / scale)
+        candidates = local_maximum & free & (strength > max(self._quality * peak, self._floor))
+        rows, columns = np.nonzero(candidates)
+        if len(rows) == 0 or count <= 0:
+            return np.zeros((0, 2))
+        values = strength[rows, columns]
+        points, values = _best_of_cells(np.stack([columns, rows], axis=-1), values, self._distance)
+        # More candidates than this change nothing but the time that the pairwise distances take.
+        points = points[self._spread(points, values, taken / scale)][: max(_CANDIDATES, 2 * count)]
+        points = points[_spaced(points, self._distance)][:count]
+        refined = _refine(strength, points)
+        # The centre of pixel x of the half-size image lies at 2x + 0.5 of the full one.
+        return refined * scale + 0.5 * (scale - 1)
+
+    def _free_space(self, taken: Array) -> np.ndarray:
+        if len(taken) == 0:
+            return self._allowed
+        height, width = self._allowed.shape
+        marks = np.full((height, width), 255, np.uint8)
+        column = np.clip(np.rint(taken[:, 0]).astype(int), 0, width - 1)
+        row = np.clip(np.rint(taken[:, 1]).astype(int), 0, height - 1)
+        marks[row, column] = 0
+        free: np.ndarray = self._allowed & (cv2.distanceTransform(marks, cv2.DIST_L2, 3) >= self._distance)
+        return free
+
+    def _spread(self, points: Array, values: Array, taken: Array) -> np.ndarray:
+        """Order corners so that the emptiest parts of the image come first, and strong before weak in each."""
+        height, width = self._allowed.shape
+        cells = np.array([width / _CELLS[0], height / _CELLS[1]])
+
+        def cell_of(pixels: Array) -> np.ndarray:
+            index = np.clip((pixels / cells).astype(int), 0, np.array(_CELLS) - 1)
+            flat: np.ndarray = index[:, 1] * _CELLS[0] + index[:, 0]
+            return flat
+
+        occupied = np.bincount(cell_of(taken), minlength=_CELLS[0] * _CELLS[1])
+        cell = cell_of(points)
+        by_cell = np.lexsort((-values, cell))
+        ordered = cell[by_cell]
+        first = np.searchsorted(ordered, ordered)
+        rank = np.empty(len(points), dtype=int)
+        rank[by_cell] = np.arange(len(points)) - first
+        order: np.ndarray = np.lexsort((-values, occupied[cell] + rank))
+        return order
+
+
+def _best_of_cells(points: np.ndarray, values: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Keep the strongest candidate of every square cell of half the distance."""
+    cell = (points / (0.5 * size)).astype(np.int64)
+    key = cell[:, 1] * 65536 + cell[:, 0]
+    order = np.lexsort((-values, key))
+    _, first = np.unique(key[order], return_index=True)
+    best = order[first]
+    return points[best], values[best]
+
+
+def _spaced(points: np.ndarray, distance: float) -> np.ndarray:
+    """Indices of a greedy choice, in the order given, with a minimum distance; a round takes many at once."""
+    count = len(points)
+    x, y = points[:, 0].astype(np.float32), points[:, 1].astype(np.float32)
+    near = ((x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 < distance * distance).astype(np.float32)
+    # Sums of 0 and 1 as matrix products, because reducing boolean arrays is slow.
+    near_earlier = np.tril(near, k=-1)
+    alive = np.ones(count, dtype=bool)
+    kept = np.zeros(count, dtype=bool)
+    while alive.any():
+        winners = alive & (near_earlier @ alive.astype(np.float32) == 0.0)
+        kept |= winners
+        alive &= near @ winners.astype(np.float32) == 0.0
+    return np.flatnonzero(kept)
+
+
+def _refine(strength: np.ndarray, points: np.ndarray) -> Array:
+    """Sub-pixel maximum (K, 2) of a parabola through each corner and its neighbours."""
+    height, width = strength.shape
+    column = np.clip(points[:, 0], 1, width - 2)
+    row = np.clip(points[:, 1], 1, height - 2)
+    centre = strength[row, column].astype(float)
+
+    def shift(before: np.ndarray, after: np.ndarray) -> Array:
+        curvature = before + after - 2.0 * centre
+        flat = curvature > -1e-12
+        step = 0.5 * (before - after) / np.where(flat, -1.0, curvature)
+        return np.where(flat, 0.0, np.clip(step, -0.5, 0.5))
+
+    x = column + shift(strength[row, column - 1].astype(float), strength[row, column + 1].astype(float))
+    y = row + shift(strength[row - 1, column].astype(float), strength[row + 1, column].astype(float))
+    return np.stack([x, y], axis=-1)
