@@ -1,5 +1,7 @@
 """Checks at the door: shape, dtype, finite values, increasing stamps. Each failure says which field."""
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -7,13 +9,14 @@ from vioframe.errors import ClockError, ShapeError
 
 Array = npt.NDArray[np.floating]
 Stamps = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
 
 
 def check_array(
     field: str,
     value: object,
     shape: tuple[int | None, ...],
-    dtype: type[np.generic] = np.floating,
+    dtype: type[Any] = np.floating,
     *,
     finite: bool = True,
 ) -> None:

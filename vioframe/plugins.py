@@ -95,7 +95,7 @@ def refuse_clashes(packages: Iterable[PluginPackage], core: Path) -> None:
     Raises:
         PluginError: names the option and both distributions.
     """
-    offered = {option: ("vioframe itself", core) for option in _options(core)}
+    offered: dict[str, tuple[str, Path | None]] = {option: ("vioframe itself", core) for option in _options(core)}
     for found in packages:
         for option in found.options:
             owner = (f"{found.package} (distribution {found.distribution})", found.folder)

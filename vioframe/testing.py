@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vioframe.checks import Array, check_pose
+from vioframe.checks import Array, Mask, check_pose
 from vioframe.conventions import NANOSECONDS, gravity_vector
 from vioframe.errors import VioframeError
 from vioframe.geometry import camera as camera_model
@@ -35,6 +35,7 @@ from vioframe.pipeline import SLOTS
 from vioframe.types import (
     Camera,
     Frame,
+    Image,
     ImuBias,
     ImuBlock,
     ImuNoise,
@@ -161,12 +162,12 @@ def _motion(t: Array, gravity: float) -> tuple[Array, Array, Array, Array]:
     return se3.from_parts(R, position), velocity, gyro, accel
 
 
-def _see(camera: Camera, T_world_body: Array, dots: Array) -> tuple[Array, np.ndarray]:
+def _see(camera: Camera, T_world_body: Array, dots: Array) -> tuple[Array, Mask]:
     T_cam_world = se3.inverse(T_world_body @ camera.T_body_cam)
     return camera_model.project(camera, se3.transform(T_cam_world, dots))
 
 
-def _draw(camera: Camera, pixels: Array) -> np.ndarray:
+def _draw(camera: Camera, pixels: Array) -> Image:
     """Bright Gaussian dots of 1.2 px on grey."""
     width, height = camera.size_px
     image = np.full((height, width), 60.0)
@@ -177,7 +178,8 @@ def _draw(camera: Camera, pixels: Array) -> np.ndarray:
         shape_x = np.exp(-0.5 * ((columns - x) / 1.2) ** 2)[inside_x]
         shape_y = np.exp(-0.5 * ((rows - y) / 1.2) ** 2)[inside_y]
         image[np.ix_(rows[inside_y], columns[inside_x])] += 150.0 * shape_y[:, None] * shape_x[None, :]
-    return np.clip(image, 0, 255).astype(np.uint8)
+    drawn: Image = np.clip(image, 0, 255).astype(np.uint8)
+    return drawn
 
 
 def check_component(component: Component) -> None:

@@ -3,7 +3,7 @@
 import queue
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -87,7 +87,7 @@ class _Failure:
         self.error = error
 
 
-def prefetch(packets: Iterable[Packet], depth: int = 16) -> Iterator[Packet]:
+def prefetch(packets: Iterable[Packet], depth: int = 16) -> Generator[Packet, None, None]:
     """Read ahead in a background thread, at most ``depth`` packets, so that decoding overlaps with estimation.
 
     Errors of the reader are raised at the place in the stream where they happened; leaving the loop early

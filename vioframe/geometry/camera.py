@@ -6,7 +6,7 @@ Radial-tangential: Brown 1966 as in OpenCV's ``calib3d``; equidistant: Kannala &
 
 import numpy as np
 
-from vioframe.checks import Array
+from vioframe.checks import Array, Mask
 from vioframe.types import Camera
 
 # Newton on the radius converges quadratically; twenty fixed-point steps are what OpenCV takes.
@@ -71,7 +71,7 @@ def undistort(camera: Camera, points: Array) -> Array:
     return points
 
 
-def project(camera: Camera, points_cam: Array) -> tuple[Array, Array]:
+def project(camera: Camera, points_cam: Array) -> tuple[Array, Mask]:
     """Pixels of points in the camera frame.
 
     Args:

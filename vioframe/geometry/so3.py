@@ -106,7 +106,8 @@ def log(R: Array) -> Array:
     angle = 2.0 * np.arctan2(sine, quat_wxyz[..., 0])
     small = sine < SMALL_ANGLE
     factor = np.where(small, 2.0 + sine**2 / 3.0, angle / np.where(small, 1.0, sine))
-    return factor[..., None] * vector
+    phi: Array = factor[..., None] * vector
+    return phi
 
 
 def left_jacobian(phi: Array) -> Array:
@@ -144,12 +145,14 @@ def normalise(R: Array) -> Array:
     sign = np.linalg.det(u @ vt)
     u = u.copy()
     u[..., :, 2] *= sign[..., None]
-    return u @ vt
+    nearest: Array = u @ vt
+    return nearest
 
 
 def angle(R: Array) -> Array:
     """Angle (...) in rad of rotations (..., 3, 3), in [0, π]."""
-    return np.linalg.norm(log(R), axis=-1)
+    angles: Array = np.linalg.norm(log(R), axis=-1)
+    return angles
 
 
 def from_two_vectors(start: Array, end: Array) -> Array:
