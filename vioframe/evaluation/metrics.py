@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vioframe.checks import Array
+from vioframe.checks import Array, Stamps
 from vioframe.conventions import NANOSECONDS
 from vioframe.errors import MetricError
 from vioframe.evaluation.align import Alignment, MatchedPoses, Motion, align, align_first, yaw_of
+from vioframe.evaluation.states import StateColumns
 from vioframe.geometry import se3, so3
-from vioframe.types import NavState
 
 # A pair for the RPE by distance may be this much longer than asked, where poses are sparse or missing.
 _MAX_OVERSHOOT = 0.2
@@ -252,19 +252,30 @@ class StateErrors:
     """Errors of states with their covariance, in the world of the truth.
 
     Attributes:
-        index: (K,) into the matched poses.
+        stamps_ns: (K,).
         theta: (K, 3) rad, local: ``R_truth = R_estimate Exp(θ)``.
         position: (K, 3) m, truth less estimate.
         covariance: (K, 6, 6), order (θ, p), p in the world of the truth.
+        tracking: (K,) whether the status was tracking.
     """
 
-    index: np.ndarray
+    stamps_ns: Stamps
     theta: Array
     position: Array
     covariance: Array
+    tracking: np.ndarray
+
+    def nees(self) -> dict[str, tuple[Array, int]]:
+        """Normalised errors (K,) of position, orientation and both, each with its degrees of freedom."""
+        both = np.concatenate([self.theta, self.position], axis=1)
+        return {
+            "position": (normalised_errors(self.position, self.covariance[:, 3:, 3:]), 3),
+            "orientation": (normalised_errors(self.theta, self.covariance[:, :3, :3]), 3),
+            "pose": (normalised_errors(both, self.covariance), 6),
+        }
 
 
-def initial_alignment(matched: MatchedPoses, states: Sequence[NavState], init: str) -> Motion:
+def initial_alignment(matched: MatchedPoses, states: StateColumns, init: str) -> Motion:
     """What an odometry with gravity may choose freely, fixed at the first state with status tracking.
 
     A fuser that starts itself puts its world where it likes in yaw and position, and is certain of it: its
@@ -282,29 +293,26 @@ def initial_alignment(matched: MatchedPoses, states: Sequence[NavState], init: s
     """
     if init == "groundtruth":
         return Motion.identity()
-    for pose, index in enumerate(matched.estimate_index):
-        if states[index].status == "tracking":
-            return align_first(matched.T_estimate[pose], matched.T_truth[pose])
-    raise MetricError("no state with status tracking has a ground truth")
+    tracking = np.flatnonzero(states.status[matched.estimate_index] == "tracking")
+    if len(tracking) == 0:
+        raise MetricError("no state with status tracking has a ground truth")
+    return align_first(matched.T_estimate[tracking[0]], matched.T_truth[tracking[0]])
 
 
-def state_errors(matched: MatchedPoses, states: Sequence[NavState], motion: Motion) -> StateErrors:
-    """Errors of the states that have a covariance, after ``motion``; it turns the covariance of p with it."""
-    with_covariance = [
-        (pose, covariance)
-        for pose, index in enumerate(matched.estimate_index)
-        if (covariance := states[index].covariance) is not None
-    ]
-    pose_index = np.array([pose for pose, _ in with_covariance], dtype=np.int64)
-    covariance = np.array([P[:6, :6] for _, P in with_covariance]).reshape(-1, 6, 6)
-    T_estimate, T_truth = motion.apply(matched.T_estimate[pose_index]), matched.T_truth[pose_index]
+def state_errors(matched: MatchedPoses, states: StateColumns, motion: Motion) -> StateErrors:
+    """Errors of all matched states after ``motion``, which turns the covariance of p with it.
+
+    The covariance is NaN where a state has none.
+    """
+    T_estimate = motion.apply(matched.T_estimate)
     turn = np.eye(6)
     turn[3:, 3:] = motion.R
     return StateErrors(
-        index=pose_index,
-        theta=so3.log(np.swapaxes(T_estimate[:, :3, :3], -1, -2) @ T_truth[:, :3, :3]),
-        position=T_truth[:, :3, 3] - T_estimate[:, :3, 3],
-        covariance=turn @ covariance @ turn.T,
+        stamps_ns=matched.stamps_ns,
+        theta=so3.log(np.swapaxes(T_estimate[:, :3, :3], -1, -2) @ matched.T_truth[:, :3, :3]),
+        position=matched.T_truth[:, :3, 3] - T_estimate[:, :3, 3],
+        covariance=turn @ states.covariance[matched.estimate_index] @ turn.T,
+        tracking=states.status[matched.estimate_index] == "tracking",
     )
 
 
@@ -319,7 +327,7 @@ def normalised_errors(errors: Array, covariance: Array) -> Array:
     if len(errors) == 0:
         return nees
     # Positive definite is judged free of units, on the correlations.
-    deviation = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
+    deviation = np.sqrt(np.maximum(np.nan_to_num(np.diagonal(covariance, axis1=1, axis2=2)), 0.0))
     positive = np.flatnonzero((deviation > 0.0).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
     unit = deviation[positive]
     correlation = covariance[positive] / (unit[:, :, None] * unit[:, None, :])
@@ -337,8 +345,6 @@ def average_nees(nees: Array, degrees: int) -> float:
         MetricError: no covariance to weigh with.
     """
     usable = np.isfinite(nees)
-    if len(nees) == 0:
-        raise MetricError("no state with status tracking has both a covariance and a ground truth")
     if not usable.any():
-        raise MetricError(f"none of the {len(nees)} covariances is positive definite")
+        raise MetricError("no state with status tracking has a ground truth and a positive definite covariance")
     return float(nees[usable].mean()) / degrees

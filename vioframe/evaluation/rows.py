@@ -6,13 +6,15 @@ from functools import partial
 
 import numpy as np
 
+from vioframe.checks import Stamps
 from vioframe.conventions import NANOSECONDS
 from vioframe.errors import MetricError
 from vioframe.evaluation import metrics
-from vioframe.evaluation.align import Alignment, MatchedPoses, Motion, associate, path_length
+from vioframe.evaluation.align import Alignment, MatchedPoses, associate, path_length
 from vioframe.evaluation.protocol import EvaluationOptions, Output, Protocol, describe_options
 from vioframe.evaluation.run import SequenceRun
-from vioframe.types import NavState, Trajectory
+from vioframe.evaluation.states import StateColumns
+from vioframe.types import Trajectory
 
 Row = dict[str, object]
 """One entry of ``metrics.json``: plain values only."""
@@ -20,6 +22,7 @@ Row = dict[str, object]
 FARTHEST_M = 1e9
 """A position beyond this has nothing to do with the recording, and its square would swamp every sum."""
 
+NEVER_STARTED = "the system never left status starting, so there is no pose to compare"
 NO_TRUTH = "the recording has no ground truth"
 
 
@@ -62,17 +65,18 @@ def evaluate_run(run: SequenceRun, options: EvaluationOptions | None = None) -> 
         ``undefined``; no value is NaN or infinite.
     """
     options = options or EvaluationOptions()
-    states = evaluated_states(run)
-    tracking = sum(state.status == "tracking" for state in run.states)
+    columns = StateColumns.from_states(run.states)
+    states = columns.started()
+    by_status = {str(status): int((columns.status == status).sum()) for status in ("starting", "tracking", "lost")}
     row: Row = {"sequence": run.sequence, "status": run.status, "error": run.error}
-    cells = _accuracy(Trajectory.from_states(states), run.ground_truth, options)
+    cells = _accuracy(states.trajectory(), run.ground_truth, options)
     _add_consistency(cells, states, run, options)
     windows_expected = max(run.frames_expected - 1, 0)
 
     def completion() -> list[float]:
         if windows_expected == 0:
             raise MetricError(f"the recording has {run.frames_expected} frames, and a window needs two")
-        return [min(tracking / windows_expected, 1.0)]
+        return [min(by_status["tracking"] / windows_expected, 1.0)]
 
     cells.add(["completion"], completion)
     cells.add(["real_time_factor"], lambda: [_real_time_factor(run)])
@@ -81,15 +85,13 @@ def evaluate_run(run: SequenceRun, options: EvaluationOptions | None = None) -> 
     row |= {
         "frames": run.frames_expected,
         "windows": run.windows,
-        "states": {
-            status: sum(state.status == status for state in run.states) for status in ("starting", "tracking", "lost")
-        },
+        "states": by_status,
         "duration_s": run.duration_s,
         "pipeline_s": run.pipeline_s,
         "wall_s": run.wall_s,
         "counters": {name: int(count) for name, count in run.counters.items()},
         "undefined": cells.undefined,
-        "protocol": make_protocol(run, options, "causal").as_dict(),
+        "protocol": make_protocol(run, options, "causal", states.stamps_ns).as_dict(),
         "final": None,
     }
     if run.smoothed is not None:
@@ -97,22 +99,13 @@ def evaluate_run(run: SequenceRun, options: EvaluationOptions | None = None) -> 
         row["final"] = {
             **final.values,
             "undefined": final.undefined,
-            "protocol": make_protocol(run, options, "final").as_dict(),
+            "protocol": make_protocol(run, options, "final", run.smoothed.stamps_ns).as_dict(),
         }
     return row
 
 
-def evaluated_states(run: SequenceRun) -> list[NavState]:
-    """The states that are compared, drawn and written to disk: all from after the initialisation."""
-    return [state for state in run.states if state.status != "starting"]
-
-
-def make_protocol(run: SequenceRun, options: EvaluationOptions, output: Output) -> Protocol:
-    """How the numbers of this sequence are measured."""
-    if output == "causal":
-        stamps_ns = np.array([state.stamp_ns for state in evaluated_states(run)], dtype=np.int64)
-    else:
-        stamps_ns = np.zeros(0, dtype=np.int64) if run.smoothed is None else run.smoothed.stamps_ns
+def make_protocol(run: SequenceRun, options: EvaluationOptions, output: Output, stamps_ns: Stamps) -> Protocol:
+    """How the numbers of the poses at ``stamps_ns`` (N,) are measured."""
     return Protocol(
         options=options,
         output=output,
@@ -124,19 +117,9 @@ def make_protocol(run: SequenceRun, options: EvaluationOptions, output: Output) 
     )
 
 
-def rate_hz(stamps_ns: np.ndarray) -> float | None:
+def rate_hz(stamps_ns: Stamps) -> float | None:
     """Usual rate of stamps, or None for fewer than two."""
     return NANOSECONDS / float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else None
-
-
-def match_run(run: SequenceRun, options: EvaluationOptions) -> MatchedPoses:
-    """Poses of :func:`evaluated_states` with their truth.
-
-    Raises:
-        MetricError: there is no truth, or none at these stamps.
-    """
-    states = evaluated_states(run)
-    return match(Trajectory.from_states(states), run.ground_truth, options)
 
 
 def match(estimate: Trajectory, truth: Trajectory | None, options: EvaluationOptions) -> MatchedPoses:
@@ -148,7 +131,7 @@ def match(estimate: Trajectory, truth: Trajectory | None, options: EvaluationOpt
     if truth is None:
         raise MetricError(NO_TRUTH)
     if len(estimate) == 0:
-        raise MetricError("no state with status tracking or lost: the system never started")
+        raise MetricError(NEVER_STARTED)
     farthest = float(np.abs(estimate.T_world_body[:, :3, 3]).max())
     if farthest > FARTHEST_M:
         raise MetricError(f"the estimate has diverged: a position is {farthest:.2g} m from the origin")
@@ -245,42 +228,28 @@ def _rms_deg(radians: np.ndarray) -> float:
     return float(np.rad2deg(np.sqrt(np.mean(radians**2))))
 
 
-def _add_consistency(cells: _Cells, states: Sequence[NavState], run: SequenceRun, options: EvaluationOptions) -> None:
+def _add_consistency(cells: _Cells, states: StateColumns, run: SequenceRun, options: EvaluationOptions) -> None:
     names = ["anees_position", "anees_orientation", "anees_pose"]
-    if all(state.covariance is None for state in states):
-        cells.refuse(names, "the fuser gives no covariance" if states else "there is no state")
+    if not np.isfinite(states.covariance).any():
+        cells.refuse(names, "the fuser gives no covariance" if len(states) else NEVER_STARTED)
         return
     try:
-        matched = match_run(run, options)
+        matched = match(states.trajectory(), run.ground_truth, options)
         motion = metrics.initial_alignment(matched, states, run.init)
-        errors = tracking_errors(matched, states, motion, run.init)
     except MetricError as error:
         cells.refuse(names, str(error))
         return
-    position = metrics.normalised_errors(errors.position, errors.covariance[:, 3:, 3:])
-    orientation = metrics.normalised_errors(errors.theta, errors.covariance[:, :3, :3])
-    pose = metrics.normalised_errors(np.concatenate([errors.theta, errors.position], axis=1), errors.covariance)
-    cells.add(names[:1], lambda: [metrics.average_nees(position, 3)])
-    cells.add(names[1:2], lambda: [metrics.average_nees(orientation, 3)])
-    cells.add(names[2:], lambda: [metrics.average_nees(pose, 6)])
-
-
-def tracking_errors(
-    matched: MatchedPoses, states: Sequence[NavState], motion: Motion, init: str
-) -> metrics.StateErrors:
-    """Errors of the states with status tracking, but for the one that was made to meet the truth."""
     errors = metrics.state_errors(matched, states, motion)
-    tracking = np.array(
-        [states[matched.estimate_index[pose]].status == "tracking" for pose in errors.index], dtype=bool
-    )
-    if init != "groundtruth" and tracking.any():
-        tracking[int(np.argmax(tracking))] = False
-    return metrics.StateErrors(
-        index=errors.index[tracking],
-        theta=errors.theta[tracking],
-        position=errors.position[tracking],
-        covariance=errors.covariance[tracking],
-    )
+    counted = errors.tracking.copy()
+    if run.init != "groundtruth":
+        # The state that was made to meet the truth has no error of position left.
+        counted[int(np.argmax(counted))] = False
+    for name, (nees, degrees) in errors.nees().items():
+        cells.add([f"anees_{name}"], partial(_average_nees, nees[counted], degrees))
+
+
+def _average_nees(nees: np.ndarray, degrees: int) -> list[float]:
+    return [metrics.average_nees(nees, degrees)]
 
 
 def _real_time_factor(run: SequenceRun) -> float:

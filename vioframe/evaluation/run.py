@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from vioframe.checks import Array, Stamps, check_array, check_increasing
+from vioframe.checks import Array, Stamps, check_array
 from vioframe.types import Image, NavState, Trajectory
 
 RunStatus = Literal["finished", "failed", "interrupted"]
@@ -79,8 +79,6 @@ class SequenceRun:
     def __post_init__(self) -> None:
         check_array("SequenceRun.track_stamps_ns", self.track_stamps_ns, (None,), np.int64)
         check_array("SequenceRun.track_counts", self.track_counts, (len(self.track_stamps_ns),), np.int64)
-        stamps = np.array([state.stamp_ns for state in self.states], dtype=np.int64)
-        check_increasing("SequenceRun.states", stamps)
 
     @property
     def status(self) -> RunStatus:
