@@ -1,0 +1,425 @@
+"""What loosely coupled filters share around their equations: start, inertial step, standstill, status.
+
+A filter of this kind is a :class:`LooseFuser` that says how a relative pose corrects its state; its options
+come in the small groups below, which the plugins' YAML files nest.
+"""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vioframe.checks import Array
+from vioframe.conventions import NANOSECONDS, seconds
+from vioframe.error_state import (
+    InertialFilter,
+    StandstillTest,
+    add_gap,
+    chi_square_limit,
+    coasting,
+)
+from vioframe.errors import ConfigError, StateError
+from vioframe.initialisation import RestInitialiser, StillnessDetector, initial_covariance
+from vioframe.interfaces import Fuser
+from vioframe.types import (
+    ImuBias,
+    ImuNoise,
+    InertialDelta,
+    Measurement,
+    NavState,
+    RelativePose,
+    SensorRig,
+    Status,
+    SyncedWindow,
+)
+
+
+def _check_positive(group: str, **values: float) -> None:
+    for name, value in values.items():
+        if not value > 0.0:
+            raise ConfigError(f"fuser.{group}.{name} must be positive, got {value}")
+
+
+def _check_not_negative(group: str, **values: float) -> None:
+    for name, value in values.items():
+        if not value >= 0.0:
+            raise ConfigError(f"fuser.{group}.{name} must not be negative, got {value}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InertialOptions:
+    """How far the inertial increments are believed.
+
+    Attributes:
+        noise_scale: factor on the white noise densities of the rig.
+        walk_scale: factor on the bias walk densities of the rig.
+        gap_allowed_s: a longer hole between samples widens the covariance.
+        gap_rate_sigma: rad/s, unknown rate inside such a hole.
+        gap_accel_sigma: m/s², unknown acceleration inside such a hole.
+    """
+
+    noise_scale: float = 1.0
+    walk_scale: float = 1.0
+    gap_allowed_s: float = 0.05
+    gap_rate_sigma: float = 0.5
+    gap_accel_sigma: float = 2.0
+
+    def __post_init__(self) -> None:
+        _check_positive("inertial", noise_scale=self.noise_scale, gap_allowed_s=self.gap_allowed_s)
+        _check_not_negative(
+            "inertial",
+            walk_scale=self.walk_scale,
+            gap_rate_sigma=self.gap_rate_sigma,
+            gap_accel_sigma=self.gap_accel_sigma,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VisualOptions:
+    """How far the relative poses are believed.
+
+    Attributes:
+        covariance_scale: factor on the covariance that the VO states, or that stands in for it.
+        rotation_sigma: rad an axis, where the VO states no covariance.
+        translation_sigma: in the unit of the VO, an axis, where it states none.
+        translation_ratio: part of the distance moved, an axis, added to that in variance.
+        gate_probability: a relative pose is used if its χ² is one that a true one stays below with this
+            probability; 1 uses all.
+        lost_after_s: seconds without a used one, moving, after which the status is ``lost``.
+    """
+
+    covariance_scale: float = 1.0
+    rotation_sigma: float = 0.002
+    translation_sigma: float = 0.005
+    translation_ratio: float = 0.02
+    gate_probability: float = 0.9999
+    lost_after_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_positive(
+            "visual",
+            covariance_scale=self.covariance_scale,
+            rotation_sigma=self.rotation_sigma,
+            lost_after_s=self.lost_after_s,
+        )
+        _check_not_negative(
+            "visual", translation_sigma=self.translation_sigma, translation_ratio=self.translation_ratio
+        )
+        if self.translation_sigma == 0.0 and self.translation_ratio == 0.0:
+            raise ConfigError(
+                "fuser.visual.translation_sigma and translation_ratio are both 0: "
+                "a motion without error cannot be fused"
+            )
+        if not 0.0 < self.gate_probability <= 1.0:
+            raise ConfigError(
+                f"fuser.visual.gate_probability must be in (0, 1], got {self.gate_probability}; 1 means no gate"
+            )
+
+    def gate(self, degrees: int) -> float:
+        """Largest χ² of a residual with this many degrees of freedom that is used."""
+        return chi_square_limit(self.gate_probability, degrees) if self.gate_probability < 1.0 else np.inf
+
+    def covariance_of(self, pose: RelativePose) -> Array:
+        """Covariance (6, 6) to use, in the unit of the VO."""
+        if pose.covariance is not None:
+            return self.covariance_scale * pose.covariance
+        distance = float(np.linalg.norm(pose.T_prev_cur[:3, 3]))
+        spread = self.translation_sigma**2 + (self.translation_ratio * distance) ** 2
+        return self.covariance_scale * np.diag(np.repeat([self.rotation_sigma**2, spread], 3))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StandstillOptions:
+    """When and how sharply the motion is measured as none.
+
+    Attributes:
+        enabled: do so at all.
+        duration_s: how long the samples must have been still.
+        gyro: rad/s, scatter and mean of the rate that count as none.
+        accel: m/s², scatter of the specific force that counts as none.
+        speed: m/s, estimated speed that counts as none.
+        rotation_sigma: rad, over a window.
+        position_sigma: m, over a window.
+        velocity_sigma: m/s.
+    """
+
+    enabled: bool = True
+    duration_s: float = 0.5
+    gyro: float = 0.02
+    accel: float = 0.15
+    speed: float = 0.1
+    rotation_sigma: float = 3e-4
+    position_sigma: float = 1e-3
+    velocity_sigma: float = 0.02
+
+    def __post_init__(self) -> None:
+        _check_positive(
+            "standstill",
+            rotation_sigma=self.rotation_sigma,
+            position_sigma=self.position_sigma,
+            velocity_sigma=self.velocity_sigma,
+        )
+        _check_not_negative("standstill", speed=self.speed)
+
+    def test(self, rig: SensorRig) -> StandstillTest:
+        """The test with these limits for a sequence."""
+        detector = StillnessDetector(
+            rig, duration_s=self.duration_s, gyro_threshold=self.gyro, accel_threshold=self.accel
+        )
+        return StandstillTest(detector, gyro_limit=self.gyro, speed_limit=self.speed)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StartOptions:
+    """What is assumed of the first state.
+
+    Attributes:
+        rest_duration_s: length of the standstill that the filter starts from by itself.
+        rest_gyro: rad/s, scatter of the rate that counts as rest.
+        rest_accel: m/s², scatter of the specific force that counts as rest.
+        rest_accel_bias_sigma: m/s² an axis, of the accelerometer bias at that standstill.
+        tilt_sigma: rad, of a given state that states no covariance; so the rest.
+        yaw_sigma: rad.
+        position_sigma: m an axis.
+        velocity_sigma: m/s an axis.
+        gyro_bias_sigma: rad/s an axis.
+        accel_bias_sigma: m/s² an axis.
+    """
+
+    rest_duration_s: float = 1.0
+    rest_gyro: float = 0.02
+    rest_accel: float = 0.15
+    rest_accel_bias_sigma: float = 0.1
+    tilt_sigma: float = 2e-3
+    yaw_sigma: float = 1e-3
+    position_sigma: float = 1e-3
+    velocity_sigma: float = 0.05
+    gyro_bias_sigma: float = 0.01
+    accel_bias_sigma: float = 0.1
+
+    def __post_init__(self) -> None:
+        _check_positive(
+            "start",
+            tilt_sigma=self.tilt_sigma,
+            yaw_sigma=self.yaw_sigma,
+            position_sigma=self.position_sigma,
+            velocity_sigma=self.velocity_sigma,
+            gyro_bias_sigma=self.gyro_bias_sigma,
+            accel_bias_sigma=self.accel_bias_sigma,
+        )
+
+    def at_rest(self, rig: SensorRig) -> RestInitialiser:
+        """What waits for a standstill in a sequence."""
+        return RestInitialiser(
+            rig,
+            duration_s=self.rest_duration_s,
+            gyro_threshold=self.rest_gyro,
+            accel_threshold=self.rest_accel,
+            accel_bias_sigma=self.rest_accel_bias_sigma,
+        )
+
+    def covariance_of(self, state: NavState) -> Array:
+        """Covariance (15, 15) of a given state: its own, or the stated sigmas."""
+        if state.covariance is not None:
+            return state.covariance
+        return initial_covariance(
+            state.T_world_body[:3, :3],
+            tilt_sigma=self.tilt_sigma,
+            yaw_sigma=self.yaw_sigma,
+            position_sigma=self.position_sigma,
+            velocity_sigma=self.velocity_sigma,
+            gyro_bias_sigma=self.gyro_bias_sigma,
+            accel_bias_sigma=self.accel_bias_sigma,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class VisualMotion:
+    """A relative pose that the VO stands by: T_prev_cur (4, 4) of the camera and its covariance (6, 6), VO's unit."""
+
+    T_prev_cur: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Step:
+    """One window as a loosely coupled filter sees it.
+
+    Attributes:
+        delta: inertial increment with the stated trust in it, holes included.
+        motion: relative pose, or None.
+        at_rest: the body seems to stand still.
+        current_ns: stamp at the end.
+    """
+
+    delta: InertialDelta
+    motion: VisualMotion | None
+    at_rest: bool
+    current_ns: int
+
+
+class LooseFuser(Fuser):
+    """A filter that propagates with inertial increments and corrects with relative poses.
+
+    Args:
+        visual: trust in the relative poses.
+        inertial: trust in the inertial increments.
+        standstill: measuring no motion at rest.
+        start: what is assumed of the first state.
+    """
+
+    def __init__(
+        self,
+        *,
+        visual: VisualOptions | None = None,
+        inertial: InertialOptions | None = None,
+        standstill: StandstillOptions | None = None,
+        start: StartOptions | None = None,
+    ) -> None:
+        self._visual = visual or VisualOptions()
+        self._inertial = inertial or InertialOptions()
+        self._standstill = standstill or StandstillOptions()
+        self._start = start or StartOptions()
+        self._standstill_gate = self._visual.gate(9)
+        self._gap_allowed_ns = round(self._inertial.gap_allowed_s * NANOSECONDS)
+        self._ready = False
+
+    def setup(self, rig: SensorRig) -> None:
+        """Forget the last sequence and take the next one's calibration.
+
+        Raises:
+            ConfigError: the rig has no camera, so the lever arm of the relative poses is unknown.
+        """
+        if not rig.cameras:
+            raise ConfigError(
+                f"{type(self).__name__} needs the place of the camera on the body (rig.cameras[0].T_body_cam), "
+                "but the recording has no camera: choose fuser=imu_only, or a recording with a camera"
+            )
+        self._T_body_cam: Array = rig.cameras[0].T_body_cam
+        walk = self._inertial.walk_scale
+        self._noise: ImuNoise = replace(
+            rig.imu, gyro_walk=rig.imu.gyro_walk * walk, accel_walk=rig.imu.accel_walk * walk
+        )
+        self._gravity = rig.gravity
+        self._rest = self._start.at_rest(rig)
+        self._standstill_test = self._standstill.test(rig)
+        self._given: NavState | None = None
+        self._stamp_ns: int | None = None
+        self._supported_ns = 0
+        self._counts: dict[str, int] = {}
+        self._ready = True
+        self._filter = self._new_filter()
+
+    def start_from(self, state: NavState) -> None:
+        """Start from a given state; without a covariance the sigmas of ``start`` stand in."""
+        self._given = state
+
+    def bias(self) -> ImuBias:
+        """The estimated bias."""
+        return self._filter.body.bias if self._ready else ImuBias()
+
+    def counters(self) -> Mapping[str, int]:
+        """Relative poses missing and refused, windows with holes, standstill measurements."""
+        return dict(self._counts)
+
+    def update(self, measurement: Measurement) -> list[NavState]:
+        """Propagate over the window, then correct; empty until the filter has a first state."""
+        if not self._ready:
+            raise StateError(f"{type(self).__name__}.update was called before setup(rig): set the fuser up first")
+        window = measurement.window
+        states = []
+        if self._stamp_ns is None:
+            if self._given is None:
+                state = self._rest.push(window)
+                if state is not None:
+                    states.append(self._begin(state, self._start.covariance_of(state), window.current.stamp_ns))
+                return states
+            covariance = self._start.covariance_of(self._given)
+            states.append(self._begin(self._given, covariance, window.previous.stamp_ns))
+            self._given = None
+        step = self._prepare(measurement)
+        if self._advance(step):
+            self._supported_ns = step.current_ns
+        self._stamp_ns = step.current_ns
+        states.append(self._emit(self._status()))
+        return states
+
+    def _begin(self, state: NavState, covariance: Array, stamp_ns: int) -> NavState:
+        self._filter.start(state, covariance)
+        self._stamp_ns = self._supported_ns = stamp_ns
+        self._started(stamp_ns)
+        return self._emit(self._status())
+
+    def _prepare(self, measurement: Measurement) -> Step:
+        window, pose = measurement.window, measurement.relative_pose
+        if window.previous.stamp_ns != self._stamp_ns:
+            self._coast_to(window)
+        delta = measurement.inertial_delta
+        if delta is None:
+            raise StateError(f"{type(self).__name__}.update needs an inertial increment: set integrator=preintegration")
+        if self._inertial.noise_scale != 1.0:
+            # Integrating again would give the unscaled covariance back.
+            covariance = self._inertial.noise_scale**2 * delta.covariance
+            delta = replace(delta, covariance=covariance, reintegrate=None)
+        if window.gap_ns > self._gap_allowed_ns:
+            self._count("inertial gaps")
+            delta = add_gap(
+                delta, seconds(window.gap_ns), self._inertial.gap_rate_sigma, self._inertial.gap_accel_sigma
+            )
+        at_rest = self._standstill.enabled and self._standstill_test.push(window, self._filter.body)
+        motion = None
+        if pose is None or not pose.valid:
+            self._count("missing VO updates")
+        else:
+            motion = VisualMotion(T_prev_cur=pose.T_prev_cur, covariance=self._visual.covariance_of(pose))
+        return Step(delta=delta, motion=motion, at_rest=at_rest, current_ns=window.current.stamp_ns)
+
+    def _coast_to(self, window: SyncedWindow) -> None:
+        """Cross a stretch for which no window came."""
+        self._count("missing windows")
+        last_ns = self._stamp_ns if self._stamp_ns is not None else window.previous.stamp_ns
+        duration = seconds(window.previous.stamp_ns - last_ns)
+        options = self._inertial
+        delta = coasting(
+            self._filter.body, duration, self._filter.gravity, options.gap_rate_sigma, options.gap_accel_sigma
+        )
+        self._advance(Step(delta=delta, motion=None, at_rest=False, current_ns=window.previous.stamp_ns))
+
+    def _stand_still(self) -> bool:
+        """Measure no motion since the clone; False if the measurement does not fit."""
+        options = self._standstill
+        H, residual, noise = self._filter.standstill_measurement(
+            options.rotation_sigma, options.position_sigma, options.velocity_sigma
+        )
+        if self._filter.innovation(H, residual, noise)[1] > self._standstill_gate:
+            self._count("gated standstills")
+            return False
+        self._correct(H, residual, noise)
+        self._count("standstill updates")
+        return True
+
+    def _count(self, what: str) -> None:
+        self._counts[what] = self._counts.get(what, 0) + 1
+
+    def _status(self) -> Status:
+        elapsed = seconds((self._stamp_ns or 0) - self._supported_ns)
+        return "lost" if elapsed > self._visual.lost_after_s else "tracking"
+
+    def _emit(self, status: Status) -> NavState:
+        return self._filter.nav_state(self._stamp_ns or 0, status)
+
+    def _new_filter(self) -> InertialFilter:
+        """A filter with the errors that the plugin appends."""
+        return InertialFilter(extra=0, noise=self._noise, gravity=self._gravity)
+
+    def _started(self, stamp_ns: int) -> None:
+        """The filter has just taken its first state."""
+
+    def _correct(self, H: Array, residual: Array, noise: Array) -> None:
+        """Update the filter, and what the plugin appended to it."""
+        self._filter.correct(H, residual, noise)
+
+    @abstractmethod
+    def _advance(self, step: Step) -> bool:
+        """Propagate over a window and correct; True if a measurement supports the new state."""
