@@ -1,0 +1,209 @@
+"""The pipeline: wiring, order of calls, one path for streams and recordings, honest timers."""
+
+import time
+
+import numpy as np
+import pytest
+from vioframe.errors import PluginError, StateError, WiringError
+from vioframe.interfaces import (
+    INERTIAL_DELTA,
+    METRIC_SCALE,
+    RELATIVE_POSE,
+    STEREO,
+    Frontend,
+    Fuser,
+    Synchronizer,
+    VOEstimator,
+)
+from vioframe.pipeline import Pipeline
+from vioframe.testing import make_scene
+from vioframe.types import NavState, RelativePose, SensorRig, SyncedWindow, VisualFeatures
+
+SCENE = make_scene()
+
+
+class Replay(Synchronizer):
+    """Gives the scene's windows as their current frames come in."""
+
+    def setup(self, rig):
+        self.windows = {window.current.stamp_ns: window for window in SCENE.windows}
+
+    def push(self, packet) -> list[SyncedWindow]:
+        window = self.windows.get(getattr(packet, "stamp_ns", None))
+        return [] if window is None else [window]
+
+    def flush(self) -> list[SyncedWindow]:
+        return []
+
+
+class Sight(Frontend):
+    provides = frozenset({"depth"})
+
+    def setup(self, rig):
+        self.seen = []
+
+    def process(self, frame, R_prev_cur=None):
+        self.seen.append((frame.stamp_ns, R_prev_cur))
+        return VisualFeatures(frame=frame, extras={"depth": np.ones((2, 2))})
+
+
+class Steps(VOEstimator):
+    provides = frozenset({RELATIVE_POSE, METRIC_SCALE})
+
+    def estimate(self, previous, current):
+        assert previous.frame.stamp_ns < current.frame.stamp_ns
+        return RelativePose(T_prev_cur=np.eye(4))
+
+
+class Keep(Fuser):
+    def setup(self, rig):
+        self.measurements = []
+        self.started = None
+
+    def start_from(self, state):
+        self.started = state
+
+    def update(self, measurement):
+        self.measurements.append(measurement)
+        return [NavState(stamp_ns=measurement.window.current.stamp_ns, T_world_body=np.eye(4))]
+
+
+class NeedsDepth(Keep):
+    requires = frozenset({"depth"})
+
+
+class NeedsMetric(Keep):
+    requires = frozenset({RELATIVE_POSE, METRIC_SCALE})
+
+
+class NeedsStereo(Frontend):
+    requires = frozenset({STEREO})
+
+    def process(self, frame, R_prev_cur=None):
+        return VisualFeatures(frame=frame)
+
+
+def test_unmet_need_names_the_physics_and_all_choices():
+    with pytest.raises(WiringError) as caught:
+        Pipeline(
+            synchronizer=Replay(),
+            frontend=Sight(),
+            fuser=NeedsMetric(),
+            choices={"synchronizer": "interpolate", "frontend": "klt", "fuser": "ekf"},
+        )
+    message = str(caught.value)
+    assert message.startswith("fuser=ekf needs metric_scale and relative_pose, which nothing before it provides")
+    assert "frontend=klt" in message and "vo=none" in message and "integrator=none" in message
+
+
+def test_strangers_name_is_exchanged_without_the_core_knowing_it():
+    pipeline = Pipeline(synchronizer=Replay(), frontend=Sight(), fuser=NeedsDepth())
+    pipeline.setup(SCENE.rig)
+    list(pipeline.run(SCENE.packets()))
+    assert pipeline.fuser.measurements[0].features.extras["depth"].shape == (2, 2)
+    with pytest.raises(WiringError, match="depth"):
+        Pipeline(synchronizer=Replay(), fuser=NeedsDepth())
+
+
+def test_what_comes_after_does_not_count():
+    class BackwardSight(Sight):
+        requires = frozenset({RELATIVE_POSE})
+
+    with pytest.raises(WiringError, match="frontend"):
+        Pipeline(synchronizer=Replay(), frontend=BackwardSight(), vo=Steps(), fuser=Keep())
+
+
+def test_recording_without_the_cameras_is_refused_at_setup():
+    pipeline = Pipeline(synchronizer=Replay(), frontend=NeedsStereo(), fuser=Keep(), choices={"frontend": "pair"})
+    mono = SensorRig(cameras=SCENE.rig.cameras[:1], imu=SCENE.rig.imu)
+    with pytest.raises(WiringError, match=r"frontend=pair needs the images of 2 cameras, but the recording gives 1"):
+        pipeline.setup(mono)
+    blind = SensorRig(cameras=SCENE.rig.cameras, imu=SCENE.rig.imu, has_images=False)
+    with pytest.raises(WiringError, match="gives 0"):
+        pipeline.setup(blind)
+
+
+def test_calls_out_of_order_are_refused():
+    pipeline = Pipeline(synchronizer=Replay(), fuser=Keep())
+    with pytest.raises(StateError, match="setup"):
+        pipeline.push(SCENE.frames[0])
+    with pytest.raises(StateError, match="setup"):
+        pipeline.flush()
+
+
+def test_running_a_recording_is_pushing_its_packets():
+    pushed = Pipeline(synchronizer=Replay(), frontend=Sight(), vo=Steps(), fuser=Keep())
+    pushed.setup(SCENE.rig)
+    one_by_one = [state for packet in SCENE.packets() for state in pushed.push(packet)] + pushed.flush()
+    run = Pipeline(synchronizer=Replay(), frontend=Sight(), vo=Steps(), fuser=Keep())
+    run.setup(SCENE.rig)
+    assert [s.stamp_ns for s in run.run(SCENE.packets())] == [s.stamp_ns for s in one_by_one]
+    assert len(one_by_one) == len(SCENE.windows)
+
+
+def test_every_frame_is_seen_once_and_in_order():
+    sight = Sight()
+    pipeline = Pipeline(synchronizer=Replay(), frontend=sight, vo=Steps(), fuser=Keep())
+    pipeline.setup(SCENE.rig)
+    list(pipeline.run(SCENE.packets()))
+    assert [stamp for stamp, _ in sight.seen] == [frame.stamp_ns for frame in SCENE.frames]
+
+
+def test_given_state_reaches_the_fuser_at_the_first_window_where_it_is_known():
+    fuser = Keep()
+    pipeline = Pipeline(synchronizer=Replay(), fuser=fuser)
+    known_from = SCENE.frames[4].stamp_ns
+
+    def look_up(stamp_ns: int) -> NavState | None:
+        return NavState(stamp_ns=stamp_ns, T_world_body=np.eye(4)) if stamp_ns >= known_from else None
+
+    pipeline.setup(SCENE.rig, look_up)
+    list(pipeline.run(SCENE.packets()))
+    assert fuser.started.stamp_ns == known_from
+    assert fuser.measurements[0].window.previous.stamp_ns == known_from
+
+
+def test_timers_hold_the_parts_time_and_an_observers_time_is_nobodys():
+    class Slow(Keep):
+        def update(self, measurement):
+            time.sleep(0.005)
+            return super().update(measurement)
+
+    pipeline = Pipeline(synchronizer=Replay(), fuser=Slow())
+    pipeline.setup(SCENE.rig)
+    pipeline.observe(lambda measurement, states: time.sleep(0.02))
+    list(pipeline.run(SCENE.packets()))
+    windows = len(SCENE.windows)
+    assert pipeline.timers["fuser"].seconds >= 0.005 * windows
+    assert pipeline.seconds < 0.015 * windows
+    assert pipeline.seconds >= sum(timer.seconds for timer in pipeline.timers.values())
+
+
+def test_override_with_other_parameters_is_refused_when_the_class_is_made():
+    with pytest.raises(PluginError, match=r"update must take the parameters \(self, measurement"):
+
+        class Wrong(Fuser):
+            def update(self, window):
+                return []
+
+    with pytest.raises(PluginError, match="process"):
+
+        class WithoutDefault(Frontend):
+            def process(self, frame, R_prev_cur):
+                return VisualFeatures(frame=frame)
+
+
+def test_further_parameters_with_a_default_are_allowed():
+    class Wide(Fuser):
+        def update(self, measurement, gain: float = 1.0):
+            return []
+
+    assert Wide().update(None) == []
+
+
+def test_needing_the_integrator():
+    class NeedsDelta(Keep):
+        requires = frozenset({INERTIAL_DELTA})
+
+    with pytest.raises(WiringError, match="inertial_delta"):
+        Pipeline(synchronizer=Replay(), fuser=NeedsDelta())

@@ -1,0 +1,158 @@
+"""``task=matrix``: every combination of the installed parts either runs, or is refused with its reason."""
+
+import itertools
+import json
+import logging
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from vioframe.build import OPTIONAL_SLOTS, build, build_pipeline
+from vioframe.data.recording import Dataset, Recording
+from vioframe.errors import VioframeError
+from vioframe.pipeline import SLOTS
+from vioframe.plugins import core_conf, discover, extend_hydra
+from vioframe.tasks.progress import frame_progress
+from vioframe.tasks.run_sequence import initial_state, lend_ground_truth
+from vioframe.types import Packet
+
+log = logging.getLogger(__name__)
+
+Outcome = Literal["ran", "refused", "crashed"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Combination:
+    """What became of one choice of parts.
+
+    Attributes:
+        choices: option by slot.
+        outcome: ran, refused (with vioframe's own reason), or crashed (a bug).
+        error: class of the error, or empty.
+        reason: its sentence, or empty.
+        states: how many states came out.
+    """
+
+    choices: dict[str, str]
+    outcome: Outcome
+    error: str = ""
+    reason: str = ""
+    states: int = 0
+
+
+def run(config: DictConfig) -> int:
+    """Try every combination on the same short recording; the status is 1 if any crashed."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    duration_s = float(config.task.duration_s)
+    combinations = list(enumerate_choices())
+    results = []
+    with frame_progress("combinations", len(combinations) + 1, shown=bool(config.progress)) as advance, _composer():
+        recording, packets = _record(duration_s)
+        for done, choices in enumerate(combinations, start=1):
+            results.append(try_combination(choices, recording, packets))
+            advance(done)
+    folder.mkdir(parents=True, exist_ok=True)
+    counts = Counter(result.outcome for result in results)
+    document = {"counts": dict(counts), "combinations": [asdict(result) for result in results]}
+    (folder / "matrix.json").write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+    _print(results, folder)
+    return 1 if counts["crashed"] else 0
+
+
+def enumerate_choices() -> Iterator[dict[str, str]]:
+    """Every combination of the options that vioframe and its plugins offer for the five slots."""
+    offered: dict[str, list[str]] = {slot: [] for slot in SLOTS}
+    sources = [core_conf(), *(found.conf for found in discover() if found.conf is not None)]
+    for conf in sources:
+        for slot in SLOTS:
+            offered[slot] += sorted(path.stem for path in (conf / slot).glob("*.yaml"))
+    for slot in SLOTS:
+        if slot not in OPTIONAL_SLOTS:
+            offered[slot] = [name for name in offered[slot] if name != "none"]
+    for names in itertools.product(*offered.values()):
+        yield dict(zip(SLOTS, names, strict=True))
+
+
+class _composer:
+    """Hydra's compose API inside a running job: the application's own state is put back afterwards."""
+
+    def __enter__(self) -> None:
+        self._before = GlobalHydra.instance().hydra
+        GlobalHydra.instance().clear()
+        extend_hydra()
+        self._inner = initialize_config_dir(str(core_conf()), version_base="1.3")
+        self._inner.__enter__()
+
+    def __exit__(self, *exc: object) -> None:
+        self._inner.__exit__(None, None, None)
+        GlobalHydra.instance().hydra = self._before
+
+
+def _record(duration_s: float) -> tuple[Recording, list[Packet]]:
+    """Render the recording once: a stereo walk, long enough to leave out its standstill."""
+    config = compose("config", overrides=["dataset=simulated", "rig=stereo", f"dataset.duration_s={duration_s}"])
+    dataset = build(config, "dataset", Dataset, "simulated")
+    recording = dataset.open(dataset.sequences[0])
+    return recording, list(recording.packets())
+
+
+def try_combination(choices: dict[str, str], recording: Recording, packets: list[Packet]) -> Combination:
+    """Compose, build and run one combination."""
+    overrides = [f"{slot}={name}" for slot, name in choices.items()]
+    try:
+        config = compose("config", overrides=[*overrides, "rig=stereo", "tracker=none"])
+        pipeline = build_pipeline(config, choices)
+        truth = recording.ground_truth()
+        pipeline.setup(recording.rig, initial_state("groundtruth", truth, recording.name))
+        lend_ground_truth(pipeline, truth, recording.name)
+        states = sum(1 for _ in pipeline.run(packets))
+    except VioframeError as error:
+        return Combination(choices=choices, outcome="refused", error=type(error).__name__, reason=str(error))
+    except Exception as error:
+        # Whatever else comes out is a bug in a part; it is reported with its traceback, and the others are tried.
+        log.exception("%s crashed", " ".join(overrides))
+        return Combination(choices=choices, outcome="crashed", error=type(error).__name__, reason=str(error))
+    if not states:
+        return Combination(choices=choices, outcome="crashed", error="StateError", reason="ran, but gave no state")
+    return Combination(choices=choices, outcome="ran", states=states)
+
+
+def _print(results: list[Combination], folder: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    ran = [result for result in results if result.outcome == "ran"]
+    table = Table(title="Combinations that run", title_justify="left")
+    for slot in ("frontend", "vo", "integrator", "fuser"):
+        table.add_column(slot)
+    table.add_column("synchronizers")
+    grouped: dict[tuple[str, ...], list[str]] = {}
+    for result in ran:
+        key = tuple(result.choices[slot] for slot in ("frontend", "vo", "integrator", "fuser"))
+        grouped.setdefault(key, []).append(result.choices["synchronizer"])
+    for key, synchronizers in grouped.items():
+        table.add_row(*key, " ".join(synchronizers))
+    console.print(table)
+    refusals = Table(title="Why the others are refused", title_justify="left")
+    refusals.add_column("combinations", justify="right")
+    refusals.add_column("reason", overflow="fold")
+    reasons = Counter(result.reason.partition(" (")[0] for result in results if result.outcome == "refused")
+    for reason, count in reasons.most_common():
+        refusals.add_row(str(count), reason)
+    console.print(refusals)
+    for result in results:
+        if result.outcome == "crashed":
+            console.print(f"[red]crashed[/red] {result.choices}: {result.error}: {result.reason}")
+    counts = Counter(result.outcome for result in results)
+    console.print(
+        f"{len(results)} combinations: {counts['ran']} ran, {counts['refused']} refused with a reason, "
+        f"{counts['crashed']} crashed. Each one's reason: {folder / 'matrix.json'}"
+    )
