@@ -81,8 +81,8 @@ def read_table(
     if finite and not np.isfinite(values).all():
         bad_row, bad_column = (int(i) for i in np.argwhere(~np.isfinite(values))[0])
         raise DataError(
-            f"{path}:{lines[bad_row]}: column {bad_column + 1} is {rows[bad_row][bad_column].strip()}, but {what} must be finite: "
-            "remove or repair the row"
+            f"{path}:{lines[bad_row]}: column {bad_column + 1} is {rows[bad_row][bad_column].strip()}, but {what} must "
+            "be finite: remove or repair the row"
         )
     return Table(
         path=path,

@@ -1,1 +1,6 @@
 """Recordings on disk: EuRoC and TUM-VI (ASL folders), KITTI odometry, KITTI raw."""
+
+from vioframe_recordings.euroc import EurocDataset
+from vioframe_recordings.tumvi import TumviDataset
+
+__all__ = ["EurocDataset", "TumviDataset"]

@@ -62,7 +62,7 @@ def test_missing_file(tmp_path: Path) -> None:
 
 def test_repeated_stamps(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = write(tmp_path, f"1.0 {IDENTITY_TUM}\n2.0 {IDENTITY_TUM}\n2.0 5 0 0 0 0 0 1\n3.0 {IDENTITY_TUM}\n")
-    with pytest.raises(ClockError, match=":3: .*repeats"):
+    with pytest.raises(ClockError, match=r":3: .*repeats"):
         read_trajectory(path, repeated="refuse")
     read = read_trajectory(path)
     assert read.stamps_ns.tolist() == [1_000_000_000, 2_000_000_000, 3_000_000_000]
