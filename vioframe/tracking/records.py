@@ -10,6 +10,9 @@ MAX_KEY = 250
 # Servers before MLflow 2.10 refuse parameter values beyond 500 characters; newer ones take 6000.
 MAX_VALUE = 500
 
+# Text that belongs to a row of metrics without being one.
+_NO_METRICS = frozenset({"protocol", "undefined"})
+
 _FORBIDDEN = re.compile(r"[^\w\-. /]", flags=re.ASCII)
 
 
@@ -50,6 +53,17 @@ def _leaves(node: Mapping[str, object], prefix: str) -> Iterator[tuple[str, obje
             yield path, value
 
 
+def _numbers(row: Mapping[str, object]) -> dict[str, float]:
+    return {
+        key: float(value)
+        for key, value in _leaves(row, "")
+        if isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and math.isfinite(value)
+        and _NO_METRICS.isdisjoint(key.split("."))
+    }
+
+
 def metrics_of(document: Mapping[str, object]) -> dict[str, float]:
     """Flatten a ``metrics.json`` document into what a tracker records.
 
@@ -60,8 +74,8 @@ def metrics_of(document: Mapping[str, object]) -> dict[str, float]:
 
     Args:
         document: the parsed ``metrics.json``: ``{"sequences": [{"sequence": name, metric: number, ...}]}``.
-            Nested mappings are joined with a dot; ``null``, text, booleans and non-finite numbers are
-            left out.
+            Nested mappings are joined with a dot; ``null``, text, booleans, non-finite numbers and what
+            stands below ``protocol`` are left out.
     """
     entries = document.get("sequences")
     if not isinstance(entries, Sequence):
@@ -69,22 +83,14 @@ def metrics_of(document: Mapping[str, object]) -> dict[str, float]:
     tables: dict[str, dict[str, float]] = {}
     for entry in entries:
         if isinstance(entry, Mapping):
-            name = str(entry.get("sequence") or "sequence")
-            # The same sequence twice in one run (two seeds, say) must not overwrite itself.
+            name = wanted = str(entry.get("sequence") or "sequence")
+            # The same sequence twice in one run must not overwrite itself.
             while name in tables:
-                name += "'"
-            tables[name] = {
-                key: float(value)
-                for key, value in _leaves(entry, "")
-                if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            }
+                name = f"{wanted}_{len(tables) + 1}"
+            tables[name] = _numbers(entry)
     if len(tables) == 1:
         return {clean_name(key): value for table in tables.values() for key, value in table.items()}
-    numbers = {
-        clean_name(f"{name.replace(chr(39), '_again')}/{key}"): value
-        for name, table in tables.items()
-        for key, value in table.items()
-    }
+    numbers = {clean_name(f"{name}/{key}"): value for name, table in tables.items() for key, value in table.items()}
     shared = set.intersection(*(set(table) for table in tables.values())) if tables else set()
     for key in sorted(shared):
         values = [table[key] for table in tables.values()]

@@ -170,13 +170,11 @@ def create_store(uri: str, experiment: str = "vioframe", *, timeout_s: float = 5
         ConfigError: the file cannot be written, is no MLflow store, or the server refuses.
     """
     path = sqlite_path(uri)
+    import_mlflow(timeout_s)
     if path is None:
-        import_mlflow(timeout_s)
         return _find_experiment(uri, experiment, None)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _check_sqlite(path)
-        import_mlflow(timeout_s)
         with _locked(path.with_name(f".{path.name}.lock")):
             _check_sqlite(path)
             return _find_experiment(uri, experiment, path.parent)

@@ -268,14 +268,14 @@ class MlflowTracker(Tracker):
             except ConfigError as error:
                 if sqlite_path(self._uri) is not None or self._on_unreachable == "fail":
                     raise
-                log.warning("%s; recording to %s instead", error, self._local_uri)
+                log.warning("%s; recording to %s", error, self._local_uri)
         elif self._on_unreachable == "fail":
             raise ConfigError(
                 f"tracker.uri={shown} cannot be reached ({reason}): start that server, record locally with "
                 "tracker.on_unreachable=local, or record nothing with tracker=none"
             )
         else:
-            log.warning("tracker.uri=%s cannot be reached (%s); recording to %s instead", shown, reason, self._local_uri)
+            log.warning("tracker.uri=%s cannot be reached (%s); recording to %s", shown, reason, self._local_uri)
         self._uri = self._local_uri
         return create_store(self._uri, self._experiment, timeout_s=self._timeout_s)
 
