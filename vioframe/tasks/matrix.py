@@ -97,7 +97,7 @@ class _composer:
 
 def _record(duration_s: float) -> tuple[Recording, list[Packet]]:
     """Render the recording once: a stereo walk, long enough to leave out its standstill."""
-    config = compose("config", overrides=["dataset=simulated", "rig=stereo", f"dataset.duration_s={duration_s}"])
+    config = compose("config", overrides=["rig=stereo", f"dataset.duration_s={duration_s}", "dataset.standstill_s=0"])
     dataset = build(config, "dataset", Dataset, "simulated")
     recording = dataset.open(dataset.sequences[0])
     return recording, list(recording.packets())
