@@ -375,7 +375,7 @@ def _error_panel(
         limit = max(limit, min(1.1 * float(bound[known].max()), 5.0 * largest))
         inside = float((np.abs(values[known]) <= bound[known]).mean())
         axes.text(
-            0.995, 0.95, f"{100 * inside:.1f} % inside", transform=axes.transAxes, ha="right", va="top",
+            0.01, 0.95, f"{100 * inside:.1f} % inside", transform=axes.transAxes, ha="left", va="top",
             fontsize=8, color="#5a5a5a",
         )  # fmt: skip
     axes.plot(time_s, broken[:, 0], color=ESTIMATE, linewidth=1.1, label="truth − estimate")
@@ -490,7 +490,7 @@ def draw_frames(drawing: Drawing) -> "Figure | None":
         axes.imshow(sample.image, cmap="gray", vmin=0, vmax=255, interpolation="antialiased")
         if len(sample.ids):
             axes.scatter(
-                *sample.pixels.T, c=sample.ids / max(newest, 1), cmap="plasma", vmin=0, vmax=1, s=16,
+                *sample.pixels.T, c=np.argsort(np.argsort(sample.ids)) / max(len(sample.ids) - 1, 1), cmap="plasma", vmin=0, vmax=1, s=16,
                 edgecolors="black", linewidths=0.5,
             )  # fmt: skip
         axes.set_xlim(-0.5, shape[1] - 0.5)
