@@ -1,0 +1,120 @@
+"""Dead reckoning with the inertial sensor alone."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+from vioframe.conventions import NANOSECONDS, seconds
+from vioframe.error_state import InertialFilter, add_gap, coasting
+from vioframe.errors import StateError
+from vioframe.interfaces import INERTIAL_DELTA, Fuser
+from vioframe.loose_fusion import InertialOptions, StandstillOptions, StartOptions
+from vioframe.types import ImuBias, InertialDelta, Measurement, NavState, SensorRig
+
+
+class ImuOnlyFuser(Fuser):
+    """Integrates inertial increments from a known start, with the covariance that this implies.
+
+    Args:
+        inertial: trust in the inertial increments.
+        standstill: zero-velocity updates; off unless enabled, since a car that coasts on a smooth straight
+            road reads as one that stands.
+        start: what is assumed of the first state.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({INERTIAL_DELTA})
+
+    def __init__(
+        self,
+        *,
+        inertial: InertialOptions | None = None,
+        standstill: StandstillOptions | None = None,
+        start: StartOptions | None = None,
+    ) -> None:
+        self._inertial = inertial or InertialOptions()
+        self._standstill = standstill or StandstillOptions(enabled=False)
+        self._start = start or StartOptions()
+        self._gap_allowed_ns = round(self._inertial.gap_allowed_s * NANOSECONDS)
+        self._filter: InertialFilter | None = None
+
+    def setup(self, rig: SensorRig) -> None:
+        """Forget the last sequence; take noise densities and gravity of the next."""
+        walk = self._inertial.walk_scale
+        noise = replace(rig.imu, gyro_walk=rig.imu.gyro_walk * walk, accel_walk=rig.imu.accel_walk * walk)
+        self._filter = InertialFilter(extra=0, noise=noise, gravity=rig.gravity)
+        self._rest = self._start.at_rest(rig)
+        self._test = self._standstill.test(rig)
+        self._given: NavState | None = None
+        self._stamp_ns: int | None = None
+        self._counts: Counter[str] = Counter()
+
+    def start_from(self, state: NavState) -> None:
+        """Start from a given state; without a covariance the sigmas of ``start`` stand in."""
+        self._given = state
+
+    def bias(self) -> ImuBias:
+        """The bias of the start, corrected by zero-velocity updates only."""
+        return ImuBias() if self._filter is None else self._filter.body.bias
+
+    def counters(self) -> Mapping[str, int]:
+        """Windows with holes, windows that never came, zero-velocity updates."""
+        return {} if self._filter is None else dict(self._counts)
+
+    def update(self, measurement: Measurement) -> list[NavState]:
+        """Move over the window; empty until the body has been seen at rest, or a state is given."""
+        if self._filter is None:
+            raise StateError("ImuOnlyFuser.update was called before setup(rig): set the fuser up first")
+        window, delta = measurement.window, measurement.inertial_delta
+        if delta is None:
+            raise StateError("fuser=imu_only needs an inertial increment: set integrator=preintegration")
+        states = []
+        if self._stamp_ns is None:
+            if self._given is None:
+                state = self._rest.push(window)
+                if state is not None:
+                    states.append(self._begin(self._filter, state, window.current.stamp_ns))
+                return states
+            states.append(self._begin(self._filter, self._given, window.previous.stamp_ns))
+            self._given = None
+        if self._stamp_ns is not None and self._stamp_ns != window.previous.stamp_ns:
+            self._counts["missing windows"] += 1
+            self._filter.propagate(self._unseen(self._filter, seconds(window.previous.stamp_ns - self._stamp_ns)))
+        self._move(self._filter, measurement, delta)
+        self._stamp_ns = window.current.stamp_ns
+        states.append(self._filter.nav_state(self._stamp_ns, "tracking"))
+        return states
+
+    def _begin(self, filter_: InertialFilter, state: NavState, stamp_ns: int) -> NavState:
+        filter_.start(state, self._start.covariance_of(state))
+        self._stamp_ns = stamp_ns
+        return filter_.nav_state(stamp_ns, "tracking")
+
+    def _unseen(self, filter_: InertialFilter, duration_s: float) -> InertialDelta:
+        options = self._inertial
+        return coasting(
+            filter_.body, duration_s, filter_.gravity, options.gap_rate_sigma, options.gap_accel_sigma
+        )
+
+    def _move(self, filter_: InertialFilter, measurement: Measurement, delta: InertialDelta) -> None:
+        options = self._inertial
+        if options.noise_scale != 1.0:
+            # Integrating again would give the unscaled covariance back.
+            delta = replace(delta, covariance=options.noise_scale**2 * delta.covariance, reintegrate=None)
+        window = measurement.window
+        if window.gap_ns > self._gap_allowed_ns:
+            self._counts["windows with inertial gaps"] += 1
+            delta = add_gap(delta, seconds(window.gap_ns), options.gap_rate_sigma, options.gap_accel_sigma)
+        if not (self._standstill.enabled and self._test.push(window, filter_.body)):
+            filter_.propagate(delta)
+            return
+        filter_.clone_pose()
+        filter_.propagate(delta)
+        standstill = self._standstill
+        filter_.correct(
+            *filter_.standstill_measurement(
+                standstill.rotation_sigma, standstill.position_sigma, standstill.velocity_sigma
+            )
+        )
+        filter_.drop_clone()
+        self._counts["zero-velocity updates"] += 1
