@@ -7,7 +7,7 @@ import importlib
 import logging
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,6 +38,7 @@ def run_job(config: "DictConfig") -> None:
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
+    in_sweep = HydraConfig.get().mode == RunMode.MULTIRUN
     try:
         status = dispatch(config)
     except VioframeError as error:
@@ -45,21 +46,15 @@ def run_job(config: "DictConfig") -> None:
             raise
         log.error("%s", error)
         status = 1
-        if HydraConfig.get().mode == RunMode.MULTIRUN:
-            record_failure(Path(HydraConfig.get().runtime.output_dir), str(error))
-    # In a multirun the others go on; main() reads what became of each from its folder.
-    if status and HydraConfig.get().mode != RunMode.MULTIRUN:
+        if in_sweep:
+            from vioframe.sweep import write_status
+
+            write_status(Path(HydraConfig.get().runtime.output_dir), "failed", str(error))
+    if status == INTERRUPTED and in_sweep:
+        raise KeyboardInterrupt
+    # In a sweep the other jobs go on; conclude() reads what became of each from its folder.
+    if status and not in_sweep:
         sys.exit(status)
-
-
-def record_failure(folder: Path, message: str) -> None:
-    """Leave word of a job that failed before it could write its own status."""
-    import json
-
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "status.json"
-    if not path.exists():
-        path.write_text(json.dumps({"status": "failed", "error": message}, indent=2) + "\n", encoding="utf-8")
 
 
 def main() -> None:
@@ -73,7 +68,20 @@ def main() -> None:
 
     import hydra
 
-    hydra.main(version_base="1.3", config_path=str(core_conf()), config_name="config")(run_job)()
+    from vioframe.sweep import conclude
+
+    interrupted = False
+    failed: Sequence[object] = ()
+    try:
+        hydra.main(version_base="1.3", config_path=str(core_conf()), config_name="config")(run_job)()
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        failed = conclude(interrupted=interrupted)
+    if interrupted:
+        sys.exit(INTERRUPTED)
+    if failed:
+        sys.exit(1)
 
 
 if __name__ == "__main__":

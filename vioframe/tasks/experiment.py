@@ -22,6 +22,7 @@ from vioframe.evaluation.rows import evaluate_run, metrics_document
 from vioframe.evaluation.run import SequenceRun
 from vioframe.evaluation.table import print_rows
 from vioframe.pipeline import Pipeline
+from vioframe.sweep import write_status
 from vioframe.tasks.progress import frame_progress
 from vioframe.tasks.run_sequence import Recorder, run_sequence
 from vioframe.tracking import Tracker, metrics_of
@@ -167,8 +168,7 @@ class _Experiment:
         status = (
             "interrupted" if any(run.interrupted for run in self.runs) else "failed" if self.failures() else "finished"
         )
-        word = {"status": status, "error": "; ".join(self.failures()) or None}
-        (self.folder / "status.json").write_text(json.dumps(word, indent=2) + "\n", encoding="utf-8")
+        write_status(self.folder, status, "; ".join(self.failures()))
         self.tracker.log_metrics(metrics_of(document))
         for name in ("metrics.json", "config.yaml", "report.html"):
             if (self.folder / name).exists():
