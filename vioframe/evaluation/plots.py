@@ -490,8 +490,7 @@ def draw_frames(drawing: Drawing) -> "Figure | None":
         axes.imshow(sample.image, cmap="gray", vmin=0, vmax=255, interpolation="antialiased")
         if len(sample.ids):
             axes.scatter(
-                *sample.pixels.T, c=np.argsort(np.argsort(sample.ids)) / max(len(sample.ids) - 1, 1), cmap="plasma", vmin=0, vmax=1, s=16,
-                edgecolors="black", linewidths=0.5,
+                *sample.pixels.T, c=np.argsort(np.argsort(sample.ids)), cmap="plasma", s=16, edgecolors="black", linewidths=0.5
             )  # fmt: skip
         axes.set_xlim(-0.5, shape[1] - 0.5)
         axes.set_ylim(shape[0] - 0.5, -0.5)

@@ -1,0 +1,172 @@
+"""The results in the terminal."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vioframe.evaluation.rows import Row
+from vioframe.evaluation.wording import (
+    CONSISTENCY,
+    RUNNING,
+    UNDEFINED,
+    Line,
+    accuracy_lines,
+    counter_text,
+    join,
+    protocol_text,
+    reasons,
+    show,
+    significant,
+)
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+    from rich.table import Table
+    from rich.text import Text
+
+_WIDE_KEYS = (
+    "path_m",
+    "ate_se3_m",
+    "ate_se3_percent",
+    "ate_sim3_m",
+    "scale_error_percent",
+    "t_rel_percent",
+    "r_rel_deg_per_100m",
+)
+
+
+def print_rows(rows: Sequence[Row], folder: Path, *, hint: str = "") -> None:
+    """Print the results and where they are.
+
+    Args:
+        rows: one per sequence.
+        folder: the output folder.
+        hint: what the tracker has to say, such as where its user interface is.
+    """
+    from rich.console import Console
+
+    console = Console()
+    for part in render_rows(rows):
+        console.print(part)
+    console.print(f"results in {folder}", style="bold", soft_wrap=True, highlight=False, markup=False)
+    report = folder / "report.html"
+    if report.exists():
+        console.print(f"report     {report}", soft_wrap=True, highlight=False, markup=False)
+    if hint:
+        console.print(hint, soft_wrap=True, highlight=False, markup=False)
+
+
+def render_rows(rows: Sequence[Row]) -> "list[RenderableType]":
+    """What :func:`print_rows` prints: one long table for one sequence, two with a row each for several."""
+    parts: list[RenderableType] = []
+    if len(rows) == 1:
+        parts += [_single(rows[0])]
+    elif rows:
+        parts += [_many_accuracy(rows), _many_running(rows)]
+    for row in rows:
+        parts += _notes(row, name=len(rows) > 1)
+    return parts + _protocols(rows)
+
+
+def _new_table(title: str) -> "Table":
+    from rich import box
+    from rich.table import Table
+
+    return Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+
+
+def _cell(text: str) -> "Text":
+    from rich.text import Text
+
+    return Text(text, style="dim" if text == UNDEFINED else "")
+
+
+def _single(row: Row) -> "Table":
+    table = _new_table(f"{row['sequence']}: {row['status']}")
+    final = row.get("final")
+    outputs = [row, final] if isinstance(final, Mapping) else [row]
+    table.add_column("")
+    for name in ("causal", "final")[: len(outputs)]:
+        table.add_column(name, justify="right")
+    table.add_column("", style="dim")
+
+    def add(label: str, values: Sequence[str], unit: str) -> None:
+        filling = [""] * (len(outputs) - len(values))
+        table.add_row(label, *map(_cell, values), *filling, unit)
+
+    for line in accuracy_lines(row):
+        add(line.label, [show(output, line, unit=False) for output in outputs], line.unit)
+    table.add_section()
+    for line in (*CONSISTENCY, *RUNNING):
+        add(line.label, [show(row, line, unit=False)], line.unit)
+    parts = row.get("ms_per_frame")
+    if isinstance(parts, Mapping):
+        table.add_section()
+        add("time per frame", [significant(float(parts["total"]))], "ms")
+        for part, milliseconds in parts.items():
+            if part != "total":
+                add(f"  {part}", [significant(float(milliseconds))], "ms")
+    return table
+
+
+def _many_accuracy(rows: Sequence[Row]) -> "Table":
+    lines = [line for line in accuracy_lines(rows[0]) if line.key in _WIDE_KEYS]
+    table = _with_columns("Accuracy (causal)", lines)
+    for row in rows:
+        table.add_row(_cell(str(row["sequence"])), *(_cell(show(row, line, unit=False)) for line in lines))
+        final = row.get("final")
+        if isinstance(final, Mapping):
+            table.add_row("  final", *(_cell(show(final, line, unit=False)) for line in lines))
+    return table
+
+
+def _many_running(rows: Sequence[Row]) -> "Table":
+    lines = [*RUNNING, *CONSISTENCY]
+    table = _with_columns("Running and consistency", lines)
+    table.add_column("ms per\nframe", justify="right")
+    table.add_column("status")
+    for row in rows:
+        parts = row.get("ms_per_frame")
+        total = significant(float(parts["total"])) if isinstance(parts, Mapping) else UNDEFINED
+        cells = [_cell(show(row, line, unit=False)) for line in lines]
+        table.add_row(_cell(str(row["sequence"])), *cells, _cell(total), str(row["status"]))
+    return table
+
+
+def _with_columns(title: str, lines: Sequence[Line]) -> "Table":
+    table = _new_table(title)
+    table.add_column("sequence", overflow="fold")
+    for line in lines:
+        table.add_column(f"{line.short}\n{line.unit}", justify="right")
+    return table
+
+
+def _notes(row: Row, *, name: bool) -> "list[RenderableType]":
+    """What went wrong, what happened, and why a metric is missing."""
+    from rich.text import Text
+
+    prefix = f"{row['sequence']}: " if name else ""
+    notes: list[RenderableType] = []
+    if row.get("error"):
+        notes.append(Text(f"{prefix}{row['status']}: {row['error']}", style="bold red"))
+    counted = counter_text(row)
+    if counted:
+        notes.append(Text(f"{prefix}{counted}", style="yellow"))
+    if row.get("windows"):
+        # Where nothing ran, the error has said everything.
+        for reason, labels in reasons(row).items():
+            notes.append(Text(f"{prefix}undefined: {join(labels)} ({reason})", style="dim"))
+    return notes
+
+
+def _protocols(rows: Sequence[Row]) -> "list[RenderableType]":
+    """The protocol of each row, once where they agree."""
+    from rich.text import Text
+
+    by_text: dict[str, list[str]] = {}
+    for row in rows:
+        if row.get("windows"):
+            by_text.setdefault(protocol_text(row), []).append(str(row["sequence"]))
+    if len(by_text) == 1:
+        return [Text(text, style="dim") for text in by_text]
+    return [Text(f"{', '.join(names)}: {text}", style="dim") for text, names in by_text.items()]
