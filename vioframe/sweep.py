@@ -163,17 +163,20 @@ def conclude(*, interrupted: bool = False) -> "list[JobResult]":
     Returns:
         the jobs that did not finish.
     """
-    from vioframe.sweep_summary import collect, markdown_table, print_table, summarise, write_files
-
     if _sweep is None:
         return []
     if _sweep.failed is not None:
         return _sweep.failed
+    from vioframe.sweep_summary import collect, markdown_table, print_table, summarise, write_files
+    from vioframe.tracking import MlflowTracker
+
     jobs = collect(_sweep.folder, _sweep.planned)
     _sweep.failed = [job for job in jobs if job.status != "finished"]
     for name in _sweep.environment:
         os.environ.pop(name, None)
     with _sweep.tracker as tracker:
+        if isinstance(tracker, MlflowTracker):
+            tracker.close_children()
         if any(job.folder for job in jobs):
             summary = summarise(jobs)
             print_table(summary)

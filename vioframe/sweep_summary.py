@@ -2,7 +2,6 @@
 
 import csv
 import json
-import math
 import re
 import statistics
 from collections.abc import Iterable, Sequence
@@ -28,6 +27,13 @@ class Column:
     decimals: int
     factor: float = 1.0
     lower_is_better: bool = True
+
+    def winner(self, values: Iterable[float]) -> float | None:
+        """Return the best of several values; ``None`` where they are all the same, and nobody wins."""
+        different = set(values)
+        if len(different) < 2:
+            return None
+        return min(different) if self.lower_is_better else max(different)
 
     def show(self, value: float | None) -> str:
         """Write one value; ``undefined`` where there is none."""
@@ -90,14 +96,14 @@ class Summary:
         chosen = list(overrides)
         return " ".join(text for text in chosen if _key(text) in self.varied) or " ".join(chosen) or "default"
 
+    def values(self, column: Column) -> list[float]:
+        """Return the values of the jobs that finished and have one."""
+        return [job.metrics[column.key] for job in self.jobs if job.status == "finished" and column.key in job.metrics]
+
     def best(self, column: Column) -> float | None:
         """Return the best value among the jobs that finished."""
-        values = [
-            job.metrics[column.key] for job in self.jobs if job.status == "finished" and column.key in job.metrics
-        ]
-        if not values:
-            return None
-        return min(values) if column.lower_is_better else max(values)
+        values = self.values(column)
+        return (min if column.lower_is_better else max)(values, default=None)
 
     def columns(self) -> list[Column]:
         """Return the columns of which at least one job has a value; the first always."""
@@ -167,7 +173,7 @@ def _read_status(folder: Path, document: dict[str, object] | None) -> tuple[str,
     if document is None:
         if status == "finished" or (folder / METRICS_FILE).exists():
             return "failed", f"it left no readable {METRICS_FILE}"
-        return "unfinished", f"it ended without a word and left no {METRICS_FILE} (killed, or out of memory?)"
+        return "unfinished", f"it ended without a word and left no {METRICS_FILE} (interrupted, killed, or out of memory)"
     sequences = document.get("sequences")
     for row in sequences if isinstance(sequences, list) else []:
         if isinstance(row, dict) and row.get("status", "finished") != "finished":
@@ -244,7 +250,7 @@ def print_table(summary: Summary, console: "Console | None" = None) -> None:
     for column in columns:
         table.add_column(Text(column.title), justify="right")
     table.add_column("status", overflow="fold")
-    best = {column.key: summary.best(column) for column in columns}
+    best = {column.key: column.winner(summary.values(column)) for column in columns}
     for job in summary.jobs:
         good = job.status == "finished"
         cells = [Text(str(job.number)), Text(summary.label(job.overrides))]
@@ -253,7 +259,7 @@ def print_table(summary: Summary, console: "Console | None" = None) -> None:
             if value is None:
                 cells.append(Text("undefined" if good else "–", style="dim"))
             else:
-                winner = good and value == best[column.key] and len(summary.jobs) > 1
+                winner = good and value == best[column.key]
                 cells.append(Text(column.show(value), style="bold green" if winner else "" if good else "dim"))
         cells.append(Text("finished") if good else Text(f"{job.status}: {job.error}", style="red"))
         table.add_row(*cells)
@@ -281,8 +287,7 @@ def _seed_table(summary: Summary, columns: Sequence[Column]) -> object:
                 if other.finished == other.jobs and column.key in other.median
             ]
             value = group.median.get(column.key)
-            best = (min if column.lower_is_better else max)(medians, default=None)
-            winner = complete and value is not None and value == best and len(summary.groups) > 1
+            winner = complete and value is not None and value == column.winner(medians)
             cells.append(Text(_spread(group, column), style="bold green" if winner else ""))
         cells.append(Text(f"{group.finished} of {group.jobs}", style="" if complete else "red"))
         table.add_row(*cells)
@@ -301,7 +306,7 @@ def markdown_table(summary: Summary) -> str:
     columns = summary.columns()
     lines = [_markdown_row(["#", "choices", *(column.title for column in columns), "status"])]
     lines.append("|" + "---|" * (len(columns) + 3))
-    best = {column.key: summary.best(column) for column in columns}
+    best = {column.key: column.winner(summary.values(column)) for column in columns}
     for job in summary.jobs:
         good = job.status == "finished"
         cells = [str(job.number), summary.label(job.overrides)]
@@ -409,8 +414,8 @@ def draw_chart(summary: Summary, path: Path) -> bool:
     axes = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
     places = list(range(len(rows)))
     for axis, column in zip(axes, columns, strict=True):
-        best = _best_row([_row_value(jobs, group, column) for _, jobs, group in rows], column)
         drawn = [value for _, jobs, group in rows if (value := _row_value(jobs, group, column)) is not None]
+        best = column.winner(drawn)
         spread = bool(drawn) and min(drawn) > 0 and max(drawn) > 50 * min(drawn)
         for place, (_, jobs, group) in enumerate(rows):
             value = _row_value(jobs, group, column)
@@ -426,7 +431,7 @@ def draw_chart(summary: Summary, path: Path) -> bool:
                     color="#b3261e" if failed else "0.5",
                 )
                 continue
-            axis.barh(place, value * column.factor, height=0.62, color="#1b7f4b" if place == best else "#8fb4d9")
+            axis.barh(place, value * column.factor, height=0.62, color="#1b7f4b" if value == best else "#8fb4d9")
             axis.annotate(
                 column.show(value),
                 (value * column.factor, place),
@@ -462,10 +467,3 @@ def _row_value(jobs: Sequence[JobResult], group: SeedGroup | None, column: Colum
     if group is not None:
         return group.median.get(column.key)
     return jobs[0].metrics.get(column.key) if jobs[0].status == "finished" else None
-
-
-def _best_row(values: Sequence[float | None], column: Column) -> int | None:
-    known = [(value, place) for place, value in enumerate(values) if value is not None and math.isfinite(value)]
-    if len(known) < 2:
-        return None
-    return min(known)[1] if column.lower_is_better else max(known)[1]

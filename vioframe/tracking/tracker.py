@@ -165,6 +165,7 @@ class MlflowTracker(Tracker):
         self._timeout_s = float(timeout_s)
         self._client: Any = None
         self._run_id: str | None = None
+        self._experiment_id = ""
         self._lost = False
 
     @property
@@ -194,7 +195,7 @@ class MlflowTracker(Tracker):
         parent = os.environ.get(PARENT_RUN_VARIABLE)
         if parent and os.environ.get(PARENT_URI_VARIABLE):
             self._uri = check_uri(PARENT_URI_VARIABLE, os.environ[PARENT_URI_VARIABLE])
-        experiment_id = self._open_store()
+        self._experiment_id = self._open_store()
         from mlflow.entities import Param
         from mlflow.tracking import MlflowClient
 
@@ -205,7 +206,7 @@ class MlflowTracker(Tracker):
         try:
             self._client = MlflowClient(tracking_uri=self._uri)
             run = self._client.create_run(
-                experiment_id,
+                self._experiment_id,
                 tags=labels,
                 run_name=self._run_name or os.environ.get(RUN_NAME_VARIABLE) or name or None,
             )
@@ -254,6 +255,25 @@ class MlflowTracker(Tracker):
             self._attempt("the message", note)
         self._attempt("the end", partial(self._client.set_terminated, self._run_id, _MLFLOW_STATUS[status]))
         self._client = None
+
+    def close_children(self) -> int:
+        """Mark nested runs that are still open as killed: their processes died without a word.
+
+        Call it on a parent when all its jobs are over. Returns how many there were.
+        """
+        if not self._is_recording():
+            return 0
+        open_runs: list[str] = []
+        query = f"tags.`mlflow.parentRunId` = '{self._run_id}' and attributes.status = 'RUNNING'"
+
+        def find() -> None:
+            found = self._client.search_runs([self._experiment_id], filter_string=query, max_results=1000)
+            open_runs.extend(run.info.run_id for run in found)
+
+        self._attempt("a search", find)
+        for run_id in open_runs:
+            self._attempt("the end of a job", partial(self._client.set_terminated, run_id, "KILLED"))
+        return len(open_runs)
 
     def _is_recording(self) -> bool:
         return self._client is not None and self._run_id is not None and not self._lost
