@@ -220,9 +220,8 @@ def segment_errors(
         lengths.append(np.full(int(fits.sum()), float(length)))
     start, end, length_m = np.concatenate(starts), np.concatenate(ends), np.concatenate(lengths)
     if len(start) == 0:
-        raise MetricError(
-            f"no segment of {min(lengths_m, default=0.0):g} m fits on the {matched.path_m:.1f} m of path that were compared"
-        )
+        shortest = min(lengths_m, default=0.0)
+        raise MetricError(f"no segment of {shortest:g} m fits on the {matched.path_m:.1f} m of path that were compared")
     error = _pair_errors(T_estimate[pose_of_frame[start]], T_estimate[pose_of_frame[end]], T_truth[start], T_truth[end])
     return SegmentErrors(
         start=start,

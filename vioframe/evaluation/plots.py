@@ -489,9 +489,8 @@ def draw_frames(drawing: Drawing) -> "Figure | None":
         shape = sample.image.shape
         axes.imshow(sample.image, cmap="gray", vmin=0, vmax=255, interpolation="antialiased")
         if len(sample.ids):
-            axes.scatter(
-                *sample.pixels.T, c=np.argsort(np.argsort(sample.ids)), cmap="plasma", s=16, edgecolors="black", linewidths=0.5
-            )  # fmt: skip
+            age = np.argsort(np.argsort(sample.ids))
+            axes.scatter(*sample.pixels.T, c=age, cmap="plasma", s=16, edgecolors="black", linewidths=0.5)
         axes.set_xlim(-0.5, shape[1] - 0.5)
         axes.set_ylim(shape[0] - 0.5, -0.5)
         time_s = float(drawing.time_s(np.array([sample.stamp_ns], dtype=np.int64))[0])

@@ -14,7 +14,7 @@ class Line:
 
     Attributes:
         key: in the row. label: in words. short: for a narrow column. unit: printed behind or above the number.
-        factor: from the stored number to the printed one. signed: show a plus.
+        factor: from the stored number to the printed one. signed: show a plus. digits: significant ones.
     """
 
     key: str
@@ -23,6 +23,7 @@ class Line:
     unit: str = ""
     factor: float = 1.0
     signed: bool = False
+    digits: int = 3
 
 
 _FIXED = (
@@ -44,7 +45,7 @@ CONSISTENCY = (
     Line(key="anees_orientation", label="ANEES per DoF, orientation", short="ANEES ori.", unit=""),
 )
 RUNNING = (
-    Line(key="completion", label="completion", short="complete", unit="%", factor=100.0),
+    Line(key="completion", label="completion", short="complete", unit="%", factor=100.0, digits=4),
     Line(key="real_time_factor", label="real-time factor", short="real time", unit="×"),
 )
 _RPE_PATTERN = re.compile(r"rpe_(?P<what>trans_percent|rot_deg|trans_m)_(?P<length>[0-9.e+-]+)(?P<unit>m|s)$")
@@ -73,7 +74,7 @@ def show(row: Mapping[str, object], line: Line, *, unit: bool = True) -> str:
     value = row.get(line.key)
     if not isinstance(value, int | float):
         return UNDEFINED
-    text = significant(value * line.factor)
+    text = significant(value * line.factor, line.digits)
     if line.signed and value > 0.0:
         text = "+" + text
     separator = "" if line.unit in ("°", "×") else " "

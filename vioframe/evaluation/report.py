@@ -1,0 +1,303 @@
+"""The output folder of an experiment: trajectories, ``metrics.json``, figures, and one page that shows it all.
+
+The page stands alone: figures are inside it, and it fetches nothing.
+"""
+
+import base64
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+
+from vioframe.evaluation.protocol import EvaluationOptions, describe_association
+from vioframe.evaluation.rows import Row, metrics_document
+from vioframe.evaluation.run import SequenceRun
+from vioframe.evaluation.states import StateColumns
+from vioframe.evaluation.wording import (
+    CONSISTENCY,
+    RUNNING,
+    UNDEFINED,
+    Line,
+    accuracy_lines,
+    counter_text,
+    join,
+    protocol_text,
+    reasons,
+    show,
+    significant,
+)
+
+log = logging.getLogger(__name__)
+
+_HALF_WIDTH = ("Tracks", "Time by part")
+
+
+def write_outputs(
+    runs: Sequence[SequenceRun],
+    rows: Sequence[Row],
+    folder: Path,
+    *,
+    config_yaml: str,
+    options: EvaluationOptions,
+    extra: Mapping[str, object] | None = None,
+) -> dict[str, object]:
+    """Write everything that an experiment leaves behind but its configuration.
+
+    With one sequence ``trajectory.tum`` (and ``trajectory_final.tum`` where there is a final one) lies in the
+    folder and its figures in ``plots/``; with several, each has ``<sequence>/trajectory.tum`` and
+    ``plots/<sequence>/``.
+
+    Args:
+        runs: the records. rows: of each run, its :func:`~vioframe.evaluation.rows.evaluate_run`.
+        folder: made if missing.
+        config_yaml: the resolved configuration, shown in the report.
+        options: of the metrics; ``plots=False`` leaves out figures and report.
+        extra: further top-level entries of ``metrics.json``.
+
+    Returns:
+        The document in ``metrics.json``.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    document = metrics_document(rows, options, extra)
+    # Numbers first: nothing that can go wrong in a drawing may cost them.
+    text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False)
+    (folder / "metrics.json").write_text(text + "\n", encoding="utf-8")
+    names = folder_names([run.sequence for run in runs])
+    for run, name in zip(runs, names, strict=True):
+        write_trajectories(run, folder if len(runs) == 1 else folder / name)
+    if options.plots:
+        from vioframe.evaluation.plots import draw_run
+
+        figures = []
+        for run, name in zip(runs, names, strict=True):
+            place = folder / "plots" if len(runs) == 1 else folder / "plots" / name
+            figures.append(draw_run(run, options, place) if len(run.states) or run.windows else {})
+        page = make_report(rows, figures, config_yaml=config_yaml, options=options, extra=extra)
+        (folder / "report.html").write_text(page, encoding="utf-8")
+    return document
+
+
+def write_trajectories(run: SequenceRun, folder: Path) -> None:
+    """Write ``trajectory.tum``, the states that the metrics compare, and ``trajectory_final.tum``."""
+    from vioframe.trajectory_io import write_tum
+
+    states = StateColumns.from_states(run.states).started()
+    if len(states):
+        write_tum(folder / "trajectory.tum", states.trajectory())
+    if run.smoothed is not None and len(run.smoothed):
+        write_tum(folder / "trajectory_final.tum", run.smoothed)
+
+
+def folder_names(sequences: Sequence[str]) -> list[str]:
+    """A different, harmless folder name for each sequence."""
+    names: list[str] = []
+    for sequence in sequences:
+        plain = "".join(c if c.isalnum() or c in "-_." else "_" for c in sequence).strip(".") or "sequence"
+        name, count = plain, 2
+        while name in names:
+            name, count = f"{plain}_{count}", count + 1
+        names.append(name)
+    return names
+
+
+def make_report(
+    rows: Sequence[Row],
+    figures: Sequence[Mapping[str, Path]],
+    *,
+    config_yaml: str,
+    options: EvaluationOptions,
+    extra: Mapping[str, object] | None = None,
+) -> str:
+    """The page as HTML.
+
+    Args:
+        rows: one per sequence.
+        figures: of each sequence, PNG files by title, in order.
+        config_yaml: the resolved configuration.
+        options: of the metrics.
+        extra: what ``metrics.json`` also says, such as the choice of parts.
+    """
+    title = f"vioframe: {rows[0]['sequence']}" if len(rows) == 1 else f"vioframe: {len(rows)} sequences"
+    body = [f"<h1>{escape(title)}</h1>", _parts_line(extra)]
+    body += [_failure(row) for row in rows if row.get("error")]
+    if len(rows) > 1:
+        body.append(_overview(rows))
+    for number, (row, paths) in enumerate(zip(rows, figures, strict=True)):
+        body.append(_sequence_section(row, paths, anchor=f"s{number}", heading=len(rows) > 1))
+    body.append(_protocol_section(options))
+    body.append(f"<h2>Configuration</h2><details><summary>resolved</summary><pre>{escape(config_yaml)}</pre></details>")
+    return _PAGE.format(title=escape(title), style=_STYLE, body="\n".join(part for part in body if part))
+
+
+def _parts_line(extra: Mapping[str, object] | None) -> str:
+    if not extra:
+        return ""
+    words = []
+    parts = extra.get("parts")
+    if isinstance(parts, Mapping):
+        shown = ("dataset", "synchronizer", "frontend", "integrator", "vo", "fuser")
+        words += [f"{name}=<b>{escape(str(parts[name]))}</b>" for name in shown if parts.get(name)]
+    if extra.get("vioframe"):
+        words.append(f"vioframe {escape(str(extra['vioframe']))}")
+    return f"<p class=parts>{' · '.join(words)}</p>" if words else ""
+
+
+def _failure(row: Row) -> str:
+    return (
+        f"<p class=failure><b>{escape(str(row['sequence']))}: {escape(str(row['status']))}.</b> "
+        f"{escape(str(row['error']))}</p>"
+    )
+
+
+def _overview(rows: Sequence[Row]) -> str:
+    keys = (
+        "path_m", "ate_se3_m", "ate_se3_percent", "ate_sim3_m", "scale_error_percent", "t_rel_percent",
+        "r_rel_deg_per_100m", "anees_position", "anees_orientation", "completion", "real_time_factor",
+    )  # fmt: skip
+    lines = [line for line in (*accuracy_lines(rows[0]), *CONSISTENCY, *RUNNING) if line.key in keys]
+    head = "".join(f"<th>{escape(line.short)}<br><small>{escape(line.unit)}</small></th>" for line in lines)
+    table = [
+        "<div class=scroll><table><thead><tr><th class=name>sequence</th>"
+        f"{head}<th>ms per frame</th><th>status</th></tr></thead><tbody>"
+    ]
+    for number, row in enumerate(rows):
+        name = f"<a href='#s{number}'>{escape(str(row['sequence']))}</a>"
+        table.append(
+            f"<tr><td class=name>{name}</td>{_cells(row, lines)}<td>{_total_ms(row)}</td>"
+            f"<td class={escape(str(row['status']))}>{escape(str(row['status']))}</td></tr>"
+        )
+        final = row.get("final")
+        if isinstance(final, Mapping):
+            accuracy = [line for line in lines if line.key in final]
+            rest = "<td></td>" * (len(lines) - len(accuracy) + 2)
+            table.append(f"<tr class=final><td class=name>final</td>{_cells(final, accuracy)}{rest}</tr>")
+    return "".join(table) + "</tbody></table></div>"
+
+
+def _cells(row: Mapping[str, object], lines: Sequence[Line]) -> str:
+    return "".join(f"<td>{_value(row, line)}</td>" for line in lines)
+
+
+def _value(row: Mapping[str, object], line: Line) -> str:
+    """The number; where there is none, ``undefined`` with its reason on hovering."""
+    text = show(row, line, unit=False)
+    if text != UNDEFINED:
+        return text
+    undefined = row.get("undefined")
+    reason = str(undefined.get(line.key, "")) if isinstance(undefined, Mapping) else ""
+    return f"<span class=undefined title='{escape(reason, quote=True)}'>{UNDEFINED}</span>"
+
+
+def _total_ms(row: Row) -> str:
+    parts = row.get("ms_per_frame")
+    return significant(float(parts["total"])) if isinstance(parts, Mapping) else UNDEFINED
+
+
+def _sequence_section(row: Row, figures: Mapping[str, Path], *, anchor: str, heading: bool) -> str:
+    html = [f"<section id={anchor}>"]
+    if heading:
+        html.append(f"<h2>{escape(str(row['sequence']))}</h2>")
+    counted = counter_text(row)
+    if counted:
+        html.append(f"<p class=counters>{escape(counted)}</p>")
+    if row.get("windows"):
+        html.append(f"<div class=columns>{_accuracy_table(row)}{_running_table(row)}</div>")
+        for reason, labels in reasons(row).items():
+            html.append(f"<p class=note>Undefined: {escape(join(labels))} ({escape(reason)}).</p>")
+        html.append(f"<p class=note>{escape(protocol_text(row))}</p>")
+    for title, path in figures.items():
+        data = base64.b64encode(path.read_bytes()).decode("ascii")
+        kind = " class=half" if title in _HALF_WIDTH else ""
+        html.append(f"<img{kind} alt='{escape(title, quote=True)}' src='data:image/png;base64,{data}'>")
+    return "\n".join([*html, "</section>"])
+
+
+def _accuracy_table(row: Row) -> str:
+    final = row.get("final")
+    outputs: list[Mapping[str, object]] = [row, final] if isinstance(final, Mapping) else [row]
+    names = "".join(f"<th>{name}</th>" for name in ("causal", "final")[: len(outputs)])
+    lines = [f"<table><thead><tr><th class=name>accuracy</th>{names}<th></th></tr></thead><tbody>"]
+    for line in accuracy_lines(row):
+        cells = "".join(f"<td>{_value(output, line)}</td>" for output in outputs)
+        lines.append(f"<tr><td class=name>{escape(line.label)}</td>{cells}<td class=unit>{escape(line.unit)}</td></tr>")
+    return "".join(lines) + "</tbody></table>"
+
+
+def _running_table(row: Row) -> str:
+    lines = ["<table><thead><tr><th class=name>consistency and running</th><th></th><th></th></tr></thead><tbody>"]
+    for line in (*CONSISTENCY, *RUNNING):
+        lines.append(
+            f"<tr><td class=name>{escape(line.label)}</td><td>{_value(row, line)}</td>"
+            f"<td class=unit>{escape(line.unit)}</td></tr>"
+        )
+    entries: list[tuple[str, str, str]] = []
+    parts = row.get("ms_per_frame")
+    if isinstance(parts, Mapping):
+        entries += [("time per frame" if p == "total" else p, significant(float(ms)), "ms") for p, ms in parts.items()]
+    states = row.get("states")
+    if isinstance(states, Mapping):
+        entries += [(f"states {status}", str(count), "") for status, count in states.items()]
+    entries += [("frames", str(row.get("frames")), ""), ("duration", significant(_number(row, "duration_s"), 4), "s")]
+    for label, value, unit in entries:
+        lines.append(f"<tr><td class=name>{escape(label)}</td><td>{value}</td><td class=unit>{unit}</td></tr>")
+    return "".join(lines) + "</tbody></table>"
+
+
+def _number(row: Row, key: str) -> float:
+    value = row.get(key)
+    return float(value) if isinstance(value, int | float) else 0.0
+
+
+def _protocol_section(options: EvaluationOptions) -> str:
+    from vioframe.evaluation.protocol import DEFINITIONS
+
+    segments = ", ".join(f"{length:g}" for length in options.segment_lengths_m)
+    facts = [
+        f"Association: {describe_association(options)}.",
+        f"t_rel and r_rel: segments of {segments} m, one starting at every {options.segment_step}th frame.",
+    ]
+    terms = "".join(
+        f"<tr><td class=name><code>{escape(key)}</code></td><td class=text>{escape(text)}</td></tr>"
+        for key, text in DEFINITIONS.items()
+    )
+    paragraphs = "".join(f"<p>{escape(fact)}</p>" for fact in facts)
+    return f"<h2>Protocol</h2>{paragraphs}<details><summary>definitions</summary><table>{terms}</table></details>"
+
+
+_STYLE = """
+:root { color-scheme: light; }
+body { font: 15px/1.5 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; color: #262626; background: #fff;
+       max-width: 1120px; margin: 2rem auto; padding: 0 1.2rem; }
+h1 { font-size: 1.7rem; margin: 0 0 .2rem; }
+h2 { font-size: 1.25rem; margin: 2.4rem 0 .6rem; border-bottom: 1px solid #ddd; padding-bottom: .25rem; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .92rem; margin: .5rem 0; }
+th { font-weight: 600; text-align: right; vertical-align: bottom; border-bottom: 1.5px solid #888; padding: .25rem .6rem; }
+th small { font-weight: 400; color: #777; }
+td { text-align: right; padding: .16rem .6rem; border-bottom: 1px solid #eee; }
+td.name, th.name, td.text { text-align: left; }
+td.unit { text-align: left; color: #777; padding-left: 0; }
+tr.final td { color: #a85a12; }
+tr.final td.name { padding-left: 1.6rem; }
+td.failed, td.interrupted { color: #b3202c; font-weight: 600; }
+.undefined { color: #999; font-style: italic; }
+.columns { display: flex; flex-wrap: wrap; gap: .5rem 3.5rem; align-items: flex-start; }
+.scroll { overflow-x: auto; }
+.parts { color: #555; margin: 0 0 1rem; }
+.failure { background: #fdecec; border-left: 4px solid #b3202c; padding: .5rem .8rem; }
+.counters { background: #fff6e0; border-left: 4px solid #d9a441; padding: .4rem .8rem; }
+.note { color: #777; font-size: .86rem; margin: .3rem 0; }
+img { width: 100%; display: block; margin: 1.2rem 0; }
+img.half { width: 49.4%; display: inline-block; margin: .4rem 0; }
+pre { background: #f6f6f6; padding: .8rem; overflow-x: auto; font-size: .84rem; }
+summary { cursor: pointer; color: #1f6fb4; }
+"""
+_PAGE = """<!doctype html>
+<html lang="en">
+<head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title><style>{style}</style></head>
+<body>
+{body}
+</body>
+</html>
+"""
