@@ -1,6 +1,7 @@
 """Recordings on disk: EuRoC and TUM-VI (ASL folders), KITTI odometry, KITTI raw."""
 
 from vioframe_recordings.euroc import EurocDataset
+from vioframe_recordings.kitti import KittiDataset
 from vioframe_recordings.tumvi import TumviDataset
 
-__all__ = ["EurocDataset", "TumviDataset"]
+__all__ = ["EurocDataset", "KittiDataset", "TumviDataset"]

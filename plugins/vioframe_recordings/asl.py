@@ -68,7 +68,7 @@ class AslDataset(Dataset):
         self,
         *,
         root: str,
-        sequence: str | Sequence[str] | None = None,
+        sequence: str | int | Sequence[str | int] | None = None,
         images: bool = True,
         cameras: int = 1,
         every: int = 1,
@@ -103,7 +103,7 @@ class AslDataset(Dataset):
         self.gap_policy = gaps.check_policy(gap_policy)
         self.max_gap_ns = round(max_gap_s * NANOSECONDS)
         self.max_fill_ns = round(max_fill_s * NANOSECONDS)
-        self._chosen = _as_list(sequence) or self._all_sequences()
+        self._chosen = as_list(sequence) or self._all_sequences()
         self._names: list[str] | None = None
 
     @property
@@ -143,6 +143,8 @@ class AslDataset(Dataset):
         kept = select_frames(stamps_ns, covered, self.every, self.start_s, self.duration_s, str(stamps_file))
         stamps_ns, paths = stamps_ns[kept], [[files[i] for i in kept] for files in paths]
         findings.append(screening.check_frame_steps(stamps_ns))
+        if truth is not None:
+            findings.append(screening.check_truth_of_frames(stamps_ns + self.camera_delay_ns, truth))
         rig_cameras = cameras[: self.camera_count] if self.images else ()
         if self.images:
             self._check_images(folder, paths, rig_cameras, findings)
@@ -298,10 +300,13 @@ def _note(subject: str, text: str) -> Finding:
     return Finding(level="note", subject=subject, text=text)
 
 
-def _as_list(sequence: str | Sequence[str] | None) -> list[str]:
+def as_list(sequence: str | int | Sequence[str | int] | None) -> list[str]:
+    """``dataset.sequence`` as names; YAML makes numbers of names that look like them."""
     if sequence is None:
         return []
-    return [sequence] if isinstance(sequence, str) else [str(name) for name in sequence]
+    if isinstance(sequence, str | int):
+        return [str(sequence)]
+    return [str(name) for name in sequence]
 
 
 def find_root(root: str | None, key: str) -> Path:

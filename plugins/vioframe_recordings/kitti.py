@@ -1,0 +1,324 @@
+"""KITTI odometry with its inertial samples, which the benchmark itself does not offer.
+
+Sequences and poses are those of the benchmark (Geiger et al., CVPR 2012); the inertial samples are the ``.mat`` files
+``imu_data_interp`` that hold ten samples per image interval, interpolated from the unsynchronised OXTS of the raw
+drives.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from vioframe.checks import Array, Stamps
+from vioframe.conventions import NANOSECONDS, seconds
+from vioframe.data.recording import Dataset, Finding
+from vioframe.errors import ConfigError, DataError
+from vioframe.geometry import se3, so3
+from vioframe.trajectory_io import read_times, read_trajectory
+from vioframe.types import Camera, ImuBlock, ImuNoise, SensorRig, Trajectory
+
+from vioframe_recordings import screening
+from vioframe_recordings.asl import as_list, check_span, find_root, names_in, select_frames, trim
+from vioframe_recordings.kitti_calibration import (
+    DriveDate,
+    odometry_drive,
+    projection_matrix,
+    read_key_numbers,
+    rectified_camera,
+    spline_velocities,
+)
+from vioframe_recordings.stored import StoredRecording, check_first_images
+
+SAMPLES_PER_FRAME = 10
+
+
+class KittiDataset(Dataset):
+    """Odometry sequences; the options are those of ``conf/dataset/kitti.yaml``, with their meaning.
+
+    The world has its origin where the vehicle is at frame 0, x along its heading there, and z up as the
+    accelerometer says (see :func:`level_world`).
+    """
+
+    def __init__(
+        self,
+        *,
+        root: str,
+        sequence: str | int | Sequence[str | int] | None = None,
+        images: bool = True,
+        cameras: int = 1,
+        color: bool = False,
+        every: int = 1,
+        start_s: float = 0.0,
+        duration_s: float | None = None,
+        camera_delay_s: float = 0.065,
+        gravity: float = 9.81,
+        gyro_noise: float = 5e-4,
+        gyro_walk: float = 1e-5,
+        accel_noise: float = 1e-2,
+        accel_walk: float = 5e-4,
+    ) -> None:
+        if cameras not in (1, 2):
+            raise ConfigError(f"dataset.cameras must be 1 or 2, got {cameras}")
+        check_span(every, start_s, duration_s)
+        self.root = find_root(root, "kitti")
+        self.images = images
+        self.camera_count = cameras
+        self.color = color
+        self.every = every
+        self.start_s = start_s
+        self.duration_s = duration_s
+        self.camera_delay_ns = round(camera_delay_s * NANOSECONDS)
+        self.gravity = gravity
+        self.densities = (gyro_noise, gyro_walk, accel_noise, accel_walk)
+        # YAML reads 04 as the number 4.
+        self._names = [name.zfill(2) for name in as_list(sequence)] or self._all_sequences()
+
+    @property
+    def sequences(self) -> Sequence[str]:
+        """Names of the sequences, two digits each."""
+        return self._names
+
+    def open(self, sequence: str) -> StoredRecording:
+        """Open and check one sequence.
+
+        Raises:
+            DataError: what is wrong, in which file and line, and what to do.
+        """
+        drive = odometry_drive(sequence)
+        if drive is None:
+            raise DataError(
+                f"dataset.sequence={sequence}: the camera-to-vehicle calibration of this sequence is not known "
+                "(00 to 10 are): take one of those"
+            )
+        folder = self.root / "sequences" / sequence
+        if not folder.is_dir():
+            raise DataError(
+                f"{folder}: no such folder; sequences under {self.root / 'sequences'}: "
+                f"{', '.join(sorted(names_in(self.root / 'sequences'))) or 'none'}"
+            )
+        findings: list[Finding] = []
+        times_file = folder / "times.txt"
+        times_ns = read_times(times_file)
+        if len(times_ns) < 5:
+            raise DataError(f"{times_file}: {len(times_ns)} frames are too few for a recording: fetch the file again")
+        imu_file = self.root / "imus_100hz_mat" / f"{sequence}.mat"
+        imu = read_imu_mat(imu_file, times_ns)
+        step_s = seconds(int(np.median(np.diff(imu.stamps_ns))))
+        findings += screening.check_samples(imu, str(imu_file), 1.0 / step_s)
+        findings.append(check_vehicle_up(imu, str(imu_file)))
+        truth = self._truth(sequence, drive, imu, times_ns, findings)
+        if truth is not None:
+            # Levelled by this accelerometer, the vertical of the truth says nothing about it.
+            findings += screening.check_with_truth(imu, truth, str(imu_file), vertical=False)
+            findings.append(check_level(imu, truth))
+        usable, paths, missing = self._available(folder, len(times_ns), findings)
+        cameras = self._cameras(folder, drive, paths, findings)
+        covered, finding = screening.check_frame_clock(times_ns, imu, self.camera_delay_ns, str(times_file))
+        findings.append(finding)
+        kept = select_frames(
+            times_ns, covered & usable, self.every, self.start_s, self.duration_s, str(times_file)
+        )
+        paths = [[files[i] for i in kept] for files in paths]
+        frame_stamps_ns = times_ns[kept]
+        findings.append(screening.check_frame_steps(frame_stamps_ns))
+        if truth is not None:
+            findings.append(screening.check_truth_of_frames(frame_stamps_ns + self.camera_delay_ns, truth))
+        rig_cameras = cameras[: self.camera_count] if self.images else ()
+        if self.images:
+            check_first_images(paths, rig_cameras, f"recording day {drive.date}", color=self.color)
+        gyro_noise, gyro_walk, accel_noise, accel_walk = self.densities
+        noise = ImuNoise(
+            gyro_noise=gyro_noise,
+            gyro_walk=gyro_walk,
+            accel_noise=accel_noise,
+            accel_walk=accel_walk,
+            rate_hz=1.0 / step_s,
+        )
+        return StoredRecording(
+            name=sequence,
+            cameras=cameras,
+            rig=SensorRig(
+                cameras=rig_cameras, imu=noise, gravity=self.gravity, camera_delay_ns=self.camera_delay_ns
+            ),
+            imu=trim(imu, frame_stamps_ns + self.camera_delay_ns),
+            frame_stamps_ns=frame_stamps_ns,
+            image_paths=paths,
+            truth=truth,
+            findings=findings,
+            color=self.color,
+            missing_images=missing,
+        )
+
+    def _all_sequences(self) -> list[str]:
+        names = sorted(
+            path.name
+            for path in self.root.glob("sequences/*")
+            if (self.root / "imus_100hz_mat" / f"{path.name}.mat").exists()
+            and (not self.images or any(folder.is_dir() for folder in self._image_folders(path)))
+        )
+        if not names:
+            raise DataError(
+                f"{self.root}: no sequence here (sequences/01 with images and imus_100hz_mat/01.mat, say, are "
+                "expected): set dataset.root, or dataset.images=false where there are none"
+            )
+        return names
+
+    def _image_folders(self, folder: Path) -> list[Path]:
+        first = 2 if self.color else 0
+        return [folder / f"image_{first + index}" for index in range(self.camera_count)]
+
+    def _available(
+        self, folder: Path, count: int, findings: list[Finding]
+    ) -> tuple[np.ndarray, list[list[Path]], int]:
+        """Which frames have all their images, the files by camera, and how many are missing in between."""
+        if not self.images:
+            return np.ones(count, dtype=bool), [], 0
+        usable = np.ones(count, dtype=bool)
+        paths = []
+        for image_folder in self._image_folders(folder):
+            names = names_in(image_folder)
+            files = [image_folder / f"{index:06d}.png" for index in range(count)]
+            usable &= np.array([path.name in names for path in files])
+            paths.append(files)
+        if usable.sum() < 2:
+            raise DataError(
+                f"{paths[0][0].parent}: has images of {int(usable.sum())} of {count} frames: fetch them, or set "
+                "dataset.images=false to run on the stamps alone"
+            )
+        there = np.flatnonzero(usable)
+        missing = int(there[-1] - there[0] + 1 - len(there))
+        level_text = f"{len(there)} of {count} frames have images"
+        complete = len(there) == count
+        findings.append(Finding(level="good" if complete else "note", subject="images", text=level_text))
+        return usable, paths, missing
+
+    def _cameras(
+        self, folder: Path, drive: DriveDate, paths: list[list[Path]], findings: list[Finding]
+    ) -> tuple[Camera, ...]:
+        path = folder / "calib.txt"
+        keys = ("P2", "P3") if self.color else ("P0", "P1")
+        values = read_key_numbers(path, required=keys)
+        cameras = tuple(
+            rectified_camera(projection_matrix(path, values, key), drive.T_body_cam0, drive.size_px) for key in keys
+        )
+        text = f"{path} ({', '.join(keys)}) and the extrinsics of {drive.date}"
+        findings.append(Finding(level="good", subject="camera calibration", text=text))
+        return cameras
+
+    def _truth(
+        self, sequence: str, drive: DriveDate, imu: ImuBlock, times_ns: Stamps, findings: list[Finding]
+    ) -> Trajectory | None:
+        path = self.root / "poses" / f"{sequence}.txt"
+        if not path.exists():
+            text = f"no {path}; the world cannot be levelled, and errors cannot be told"
+            findings.append(Finding(level="note", subject="ground truth", text=text))
+            return None
+        poses = read_trajectory(path, "kitti", stamps=times_ns + self.camera_delay_ns)
+        if len(poses) != len(times_ns):
+            raise DataError(
+                f"{path}: {len(poses)} poses for {len(times_ns)} frames in times.txt: the files are not of one sequence"
+            )
+        T_ref_body = poses.T_world_body @ se3.inverse(drive.T_body_cam0)
+        truth, up_size = level_world(poses.stamps_ns, T_ref_body, imu)
+        text = f"{path}, levelled by the mean specific force (|g| {up_size:.3f} m/s²); velocity from a spline"
+        findings.append(Finding(level="good", subject="ground truth file", text=text))
+        return truth
+
+
+def read_imu_mat(path: Path, times_ns: Stamps) -> ImuBlock:
+    """Samples of ``imu_data_interp`` (10·(frames − 1) + 1, 6): ax ay az gx gy gz, m/s² and rad/s, vehicle.
+
+    The k-th interval of images holds ten samples evenly spaced from its first stamp on: the step is
+    ``diff(times) / 10``, about 10.38 ms, not 10 ms.
+
+    Raises:
+        DataError: missing or damaged file, another number of samples, NaN.
+    """
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        content = loadmat(path)
+    except FileNotFoundError:
+        raise DataError(
+            f"{path}: no such file; it should hold the inertial samples of this sequence, interpolated to ten an image "
+            "interval"
+        ) from None
+    except (MatReadError, ValueError, NotImplementedError, OSError, TypeError, EOFError) as error:
+        raise DataError(f"{path}: cannot be read as a MATLAB 5 file ({error}): fetch it again") from None
+    names = [name for name in content if not name.startswith("__")]
+    if "imu_data_interp" not in names:
+        raise DataError(f"{path}: the variable 'imu_data_interp' is missing; the file has {', '.join(names) or 'none'}")
+    samples = np.asarray(content["imu_data_interp"], dtype=float)
+    wanted = SAMPLES_PER_FRAME * (len(times_ns) - 1) + 1
+    if samples.shape != (wanted, 6):
+        raise DataError(
+            f"{path}: imu_data_interp has shape {samples.shape}, but {len(times_ns)} frames need ({wanted}, 6): "
+            "the file is not of this sequence, or is truncated"
+        )
+    if not np.isfinite(samples).all():
+        row, column = (int(i) for i in np.argwhere(~np.isfinite(samples))[0])
+        raise DataError(f"{path}: row {row + 1}, column {column + 1} of imu_data_interp is {samples[row, column]}")
+    steps = np.diff(times_ns)[:, None]
+    inner = times_ns[:-1, None] + steps * np.arange(SAMPLES_PER_FRAME) // SAMPLES_PER_FRAME
+    stamps_ns = np.concatenate([inner.ravel(), times_ns[-1:]])
+    return ImuBlock(stamps_ns=stamps_ns, gyro=samples[:, 3:].copy(), accel=samples[:, :3].copy())
+
+
+def check_vehicle_up(imu: ImuBlock, where: str) -> Finding:
+    """A car stays upright: the mean specific force must be +g along the vehicle's z.
+
+    Raises:
+        DataError: it is not; axes or columns are swapped.
+    """
+    force = imu.accel.mean(axis=0)
+    tilt = screening.tilt_deg(force)
+    if tilt > screening.TILT_BAD_DEG:
+        raise DataError(
+            f"{where}: the mean specific force is ({force[0]:.2f}, {force[1]:.2f}, {force[2]:.2f}) m/s², {tilt:.0f}° "
+            "from the vehicle's z axis, but a car stays upright: columns or axes are swapped; put them right"
+        )
+    text = f"mean specific force {force[2]:.2f} m/s² along the vehicle's z, {tilt:.1f}° off (banked and crowned road)"
+    return Finding(level="good", subject="vehicle upright", text=text)
+
+
+def check_level(imu: ImuBlock, truth: Trajectory) -> Finding:
+    """Whether both halves of a recording agree on the vertical, which one average over both cannot tell."""
+    middle = len(truth) // 2
+    tilts = []
+    for part in (slice(None, middle), slice(middle, None)):
+        half = Trajectory(stamps_ns=truth.stamps_ns[part], T_world_body=truth.T_world_body[part])
+        if truth.v_world_body is not None:
+            half = replace(half, v_world_body=truth.v_world_body[part])
+        tilts.append(screening.tilt_deg(screening.mean_specific_force(imu, half)[0]))
+    text = f"the halves of the recording put the vertical {tilts[0]:.2f}° and {tilts[1]:.2f}° off the whole"
+    return Finding(level="good" if max(tilts) < 1.0 else "note", subject="level of the world", text=text)
+
+
+def level_world(stamps_ns: Stamps, T_ref_body: Array, imu: ImuBlock) -> tuple[Trajectory, float]:
+    """Turn poses in any fixed frame into poses in a world with z up.
+
+    Up is the specific force averaged over all samples in the true attitude, less the mean acceleration
+    of the body: ``u = (1/T) ∫ R_ref_body a dt − (v(T) − v(0)) / T``. KITTI's odometry poses start with
+    camera 0, which looks up or down by a degree or so. The heading is free: the body starts along x.
+
+    Args:
+        stamps_ns: (N,) of the poses, IMU clock.
+        T_ref_body: (N, 4, 4).
+        imu: samples that cover most of the poses.
+
+    Returns:
+        The trajectory with velocities, starting at the origin, and the magnitude of u in m/s².
+    """
+    velocity = spline_velocities(stamps_ns, T_ref_body[:, :3, 3])
+    reference = Trajectory(stamps_ns=stamps_ns, T_world_body=T_ref_body, v_world_body=velocity)
+    up, _ = screening.mean_specific_force(imu, reference)
+    R_level_ref = so3.from_two_vectors(up, np.array([0.0, 0.0, 1.0]))
+    heading = R_level_ref @ T_ref_body[0, :3, 0]
+    R_world_ref = so3.rotation_z(-np.arctan2(heading[1], heading[0])) @ R_level_ref
+    T_world_ref = se3.from_parts(R_world_ref, -R_world_ref @ T_ref_body[0, :3, 3])
+    truth = Trajectory(
+        stamps_ns=stamps_ns, T_world_body=T_world_ref @ T_ref_body, v_world_body=velocity @ R_world_ref.T
+    )
+    return truth, float(np.linalg.norm(up))
