@@ -1,0 +1,163 @@
+"""From an instant to the images of the rig: the world, the light, the shutter and the sensor."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vioframe.checks import Array
+from vioframe.data.simulator.cameras import CameraSettings
+from vioframe.data.simulator.degrade import Degradations
+from vioframe.data.simulator.families import PlannedMotion
+from vioframe.data.simulator.render import Renderer, View
+from vioframe.data.simulator.rooms import build_room
+from vioframe.data.simulator.texture import Atlas
+from vioframe.data.simulator.world import World, WorldPlan
+from vioframe.geometry import camera as camera_models
+from vioframe.geometry import se3
+from vioframe.types import Camera
+
+# Photo-electrons of a full pixel in daylight: sets how much noise low light brings.
+_FULL_WELL = 8000.0
+_BLUR_SAMPLES = 7
+
+
+def build_world(plan: PlannedMotion, seed: int, duration_s: float, degradations: Degradations) -> WorldPlan:
+    """The place a motion needs, always the same for the same seed."""
+    rng = np.random.default_rng([seed, 20])
+    times = np.arange(0.0, duration_s + 0.1, 0.1)
+    path = plan.motion.evaluate(times).T_world_body[:, :3, 3]
+    return build_room(
+        rng,
+        path,
+        place=plan.place,
+        contrast=1.0 - degradations.low_texture,
+        moving=int(degradations.moving_objects),
+    )
+
+
+class Imager:
+    """The cameras of a rig in a world.
+
+    Args:
+        plan: motion and place.
+        cameras: calibration.
+        settings: shutter and sensor noise.
+        degradations: what spoils the images.
+        seed: of noise and flicker.
+        world_seed: of the place.
+        duration_s: the world leaves room for the motion this long.
+    """
+
+    def __init__(
+        self,
+        *,
+        plan: PlannedMotion,
+        cameras: Sequence[Camera],
+        settings: CameraSettings,
+        degradations: Degradations,
+        seed: int,
+        world_seed: int,
+        duration_s: float,
+        world_plan: WorldPlan | None = None,
+    ) -> None:
+        self._motion = plan.motion
+        self._cameras = tuple(cameras)
+        self._settings = settings
+        self._degradations = degradations
+        self._seed = seed
+        self._noise_tile: np.ndarray | None = None
+        if world_plan is None:
+            world_plan = build_world(plan, world_seed, duration_s, degradations)
+        self.world = World(world_plan)
+        atlas = Atlas(world_plan.textures)
+        self._renderers = [Renderer(self.world, atlas, camera) for camera in self._cameras]
+
+    def images(self, t_s: float) -> tuple[np.ndarray, ...]:
+        """(H, W) uint8 of every camera whose first row sees the world at ``t_s``, s on the motion."""
+        return tuple(self._expose(self._grey(index, t_s), index, t_s) for index in range(len(self._cameras)))
+
+    def view(self, t_s: float, camera: int = 0) -> View:
+        """Brightness, depth and surface of an instant, without blur or noise."""
+        self.world.move_to(t_s)
+        return self._renderers[camera].render(self._pose(camera, t_s))
+
+    def depth(self, t_s: float, camera: int = 0) -> np.ndarray:
+        """Depth along the optical axis (H, W) m, exact at pixel centres; 0 where the camera is blind."""
+        self.world.move_to(t_s)
+        return self._renderers[camera].render(self._pose(camera, t_s), smooth_edges=False).depth
+
+    def flow(self, t_s: float, later_s: float, camera: int = 0) -> tuple[Array, np.ndarray]:
+        """Where the pixels of one instant are at a later one: displacement (H, W, 2) px, and seen (H, W).
+
+        ``seen`` is False where the point leaves the image, is hidden later, or the camera is blind. Points on
+        moving objects are taken as at rest.
+        """
+        model = self._cameras[camera]
+        width, height = model.size_px
+        depth = self.depth(t_s, camera).astype(float)
+        grid = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), axis=-1)
+        ideal = camera_models.normalised(model, grid)
+        points = np.concatenate([ideal, np.ones((height, width, 1))], axis=-1) * depth[..., None]
+        T_later_now = se3.inverse(self._pose(camera, later_s)) @ self._pose(camera, t_s)
+        moved = se3.transform(T_later_now, points.reshape(-1, 3)).reshape(height, width, 3)
+        pixels, inside = camera_models.project(model, moved)
+        later_depth = self.depth(later_s, camera)
+        nearest = np.clip(np.round(np.where(inside[..., None], pixels, 0.0)).astype(int), 0, (width - 1, height - 1))
+        visible = moved[..., 2] < 1.03 * later_depth[nearest[..., 1], nearest[..., 0]] + 0.02
+        return pixels - grid, inside & visible & (depth > 0.0)
+
+    def _pose(self, camera: int, t_s: float) -> Array:
+        """T_world_cam (4, 4), or (H, 4, 4) under a rolling shutter."""
+        model = self._cameras[camera]
+        readout_s = self._settings.rolling_shutter_s
+        if readout_s == 0.0:
+            pose: Array = self._motion.evaluate(t_s).T_world_body @ model.T_body_cam
+            return pose
+        height = model.size_px[1]
+        rows: Array = self._motion.evaluate(t_s + np.arange(height) * (readout_s / (height - 1))).T_world_body
+        return rows @ model.T_body_cam
+
+    def _grey(self, camera: int, t_s: float) -> np.ndarray:
+        exposure_s = self._degradations.motion_blur_s
+        if exposure_s == 0.0:
+            return self.view(t_s, camera).grey
+        # The stamp is the middle of the exposure.
+        offsets = (np.arange(_BLUR_SAMPLES) + 0.5) / _BLUR_SAMPLES - 0.5
+        total = self.view(t_s + offsets[0] * exposure_s, camera).grey
+        for offset in offsets[1:]:
+            total = total + self.view(t_s + offset * exposure_s, camera).grey
+        mean: np.ndarray = total / np.float32(_BLUR_SAMPLES)
+        return mean
+
+    def _expose(self, grey: np.ndarray, camera: int, t_s: float) -> np.ndarray:
+        """What the sensor makes of the light: gain, noise, eight bits."""
+        d = self._degradations
+        # Of the instant, not of the order of calls: a frame is the same whenever it is drawn.
+        rng = np.random.default_rng([self._seed, 30, camera, round(t_s * 1e6) + 10**9])
+        gain = 1.0 - d.low_light
+        if d.exposure_ramp > 0.0:
+            gain *= (1.0 + d.exposure_ramp) ** np.sin(2.0 * np.pi * t_s / d.exposure_period_s)
+        if d.flicker > 0.0:
+            gain *= float(np.exp(d.flicker * rng.standard_normal()))
+        light = grey * np.float32(gain)
+        noise = self._noise(rng, light.shape)
+        if d.low_light > 0.0:
+            # Shot noise of the photo-electrons left, beside the sensor's own.
+            per_grey = 255.0 / _FULL_WELL
+            sigma = np.sqrt(np.maximum(light, 0.0) * np.float32(per_grey * 8.0) + np.float32(self._settings.noise_dn**2 + 4.0))
+            light += sigma * noise
+        elif self._settings.noise_dn > 0.0:
+            light += np.float32(self._settings.noise_dn) * noise
+        light += np.float32(0.5)
+        np.clip(light, 0.0, 255.0, out=light)
+        image: np.ndarray = light.astype(np.uint8)
+        return image
+
+    def _noise(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+        """Unit white noise (H, W) float32: windows of one large sheet, since drawing it anew costs as much as the scene."""
+        height, width = shape
+        if self._noise_tile is None or self._noise_tile.shape[0] < 2 * height or self._noise_tile.shape[1] < 2 * width:
+            sheet = np.random.default_rng([self._seed, 31])
+            self._noise_tile = sheet.standard_normal((2 * height, 2 * width), dtype=np.float32)
+        y, x = int(rng.integers(height)), int(rng.integers(width))
+        return self._noise_tile[y : y + height, x : x + width]
