@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-SHORT = ("dataset.duration_s=1.5", "rig=blind", "frontend=none", "vo=none", "init=groundtruth", "tracker=none")
+SHORT = ("dataset.duration_s=3", "dataset.standstill_s=0", "rig=blind", "frontend=none", "vo=none", "init=groundtruth", "tracker=none")
 
 
 def test_strangers_fuser_runs_like_one_of_ours(install, cli, tmp_path):
