@@ -1,1 +1,6 @@
-"""Visual odometry from geometry: two-view, local map, stereo."""
+"""Visual odometry without learning: two-view, local map, stereo."""
+
+from vioframe_geometric.stereo import StereoVO
+from vioframe_geometric.two_view import TwoViewVO
+
+__all__ = ["StereoVO", "TwoViewVO"]
