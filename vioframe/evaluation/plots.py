@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 TRUTH, ESTIMATE, FINAL, LOST = "#3d3d3d", "#1f6fb4", "#e0812f", "#c8323c"
 PART_COLOURS = ("#8fa3b8", "#3f7fbf", "#58a55c", "#d9a441", "#b5596f", "#7d6bb0", "#c9c9c9")
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     "font.size": 9.5,
     "axes.titlesize": 11,
     "axes.titleweight": "bold",
@@ -43,7 +43,6 @@ _STYLE: dict[Any, Any] = {
     "figure.dpi": 100,
     "savefig.dpi": 110,
 }
-_WIDE = (10.0, 5.6)
 # More points than pixels only cost time.
 _MAX_POINTS = 4000
 
@@ -86,7 +85,7 @@ class Drawing:
 
 
 def prepare(run: SequenceRun, options: EvaluationOptions) -> Drawing:
-    """Align and match once for all figures."""
+    """Align and match once for all figures of a run."""
     columns = StateColumns.from_states(run.states)
     states = columns.started()
     protocol = make_protocol(run, options, "causal", states.stamps_ns)
@@ -97,8 +96,8 @@ def prepare(run: SequenceRun, options: EvaluationOptions) -> Drawing:
     shown, shown_name = upright, upright_name = Motion.identity(), "no"
     try:
         matched = match(states.trajectory(), run.ground_truth, options)
-        shown, shown_name = _alignment(matched, ("se3", "yaw"))
-        upright, upright_name = _alignment(matched, ("yaw",))
+        shown, shown_name = first_alignment(matched, ("se3", "yaw"))
+        upright, upright_name = first_alignment(matched, ("yaw",))
         errors = state_errors(matched, states, initial_alignment(matched, states, run.init))
     except MetricError:
         # The reason is in the row, next to each metric that it takes away; figures draw what there is.
@@ -118,7 +117,7 @@ def prepare(run: SequenceRun, options: EvaluationOptions) -> Drawing:
     )
 
 
-def _alignment(matched: MatchedPoses, choices: tuple[Alignment, ...]) -> tuple[Motion, str]:
+def first_alignment(matched: MatchedPoses, choices: tuple[Alignment, ...]) -> tuple[Motion, str]:
     """The first of the choices that the poses determine."""
     for choice in choices:
         try:
@@ -144,7 +143,7 @@ def draw_run(run: SequenceRun, options: EvaluationOptions, folder: Path) -> dict
     drawing = prepare(run, options)
     folder.mkdir(parents=True, exist_ok=True)
     paths: dict[str, Path] = {}
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         for title, name, draw in FIGURES:
             figure = draw(drawing)
             if figure is not None:
@@ -153,7 +152,8 @@ def draw_run(run: SequenceRun, options: EvaluationOptions, folder: Path) -> dict
     return paths
 
 
-def _new_figure(size_inches: tuple[float, float] = _WIDE) -> "Figure":
+def new_figure(size_inches: tuple[float, float]) -> "Figure":
+    """An empty figure that needs no display and belongs to no global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -162,7 +162,8 @@ def _new_figure(size_inches: tuple[float, float] = _WIDE) -> "Figure":
     return figure
 
 
-def _caption(figure: "Figure", text: str) -> None:
+def add_caption(figure: "Figure", text: str) -> None:
+    """Small print below: the protocol."""
     figure.supxlabel(text, fontsize=8, color="#7a7a7a", x=0.99, ha="right")
 
 
@@ -170,7 +171,7 @@ def _thin(count: int) -> slice:
     return slice(None, None, max(1, -(-count // _MAX_POINTS)))
 
 
-def _with_breaks(time_s: Array, values: Array) -> tuple[Array, Array]:
+def with_breaks(time_s: Array, values: Array) -> tuple[Array, Array]:
     """Curves that stop at holes: NaN where five usual intervals or more are missing; values (N, ...)."""
     picked = _thin(len(time_s))
     time_s, values = time_s[picked], values[picked]
@@ -226,15 +227,15 @@ def draw_top_view(drawing: Drawing) -> "Figure | None":
         return None
     position = drawing.shown.apply(drawing.states.T_world_body)[:, :3, 3]
     truth = _shown_truth(drawing)
-    figure = _new_figure((8.2, 6.8))
+    figure = new_figure((8.2, 6.8))
     axes = figure.subplots()
     if truth is not None and len(truth[0]):
-        _plot_path(axes, truth[0], truth[1][:, :3, 3], color=TRUTH, linewidth=3.2, alpha=0.45, label="ground truth")
+        plot_path(axes, truth[0], truth[1][:, :3, 3], color=TRUTH, linewidth=3.2, alpha=0.45, label="ground truth")
     smoothed = drawing.run.smoothed
     if smoothed is not None:
         final = _shown_final(drawing).apply(smoothed.T_world_body)[:, :3, 3]
-        _plot_path(axes, smoothed.stamps_ns, final, color=FINAL, linewidth=1.2, label="estimate, final")
-    _plot_path(axes, drawing.states.stamps_ns, position, color=ESTIMATE, linewidth=1.5, label="estimate, causal")
+        plot_path(axes, smoothed.stamps_ns, final, color=FINAL, linewidth=1.2, label="estimate, final")
+    plot_path(axes, drawing.states.stamps_ns, position, color=ESTIMATE, linewidth=1.5, label="estimate, causal")
     lost = drawing.states.status == "lost"
     if lost.any():
         axes.plot(*position[lost, :2].T, ".", color=LOST, markersize=4, label="lost")
@@ -251,12 +252,13 @@ def draw_top_view(drawing: Drawing) -> "Figure | None":
     axes.set_ylabel("y (m)")
     axes.set_title(f"{drawing.run.sequence}: path from above")
     _legend(figure, axes, drawing, status=False)
-    _caption(figure, drawing.caption(drawing.shown_name))
+    add_caption(figure, drawing.caption(drawing.shown_name))
     return figure
 
 
-def _plot_path(axes: "Axes", stamps_ns: Stamps, position: Array, **style: object) -> None:
-    _, broken = _with_breaks((stamps_ns - stamps_ns[0]) / NANOSECONDS, position)
+def plot_path(axes: "Axes", stamps_ns: Stamps, position: Array, **style: object) -> None:
+    """Plot the first two columns of positions (N, 2 or more) m, with breaks where poses are missing."""
+    _, broken = with_breaks((stamps_ns - stamps_ns[0]) / NANOSECONDS, position)
     axes.plot(broken[:, 0], broken[:, 1], **style)  # type: ignore[arg-type]
 
 
@@ -266,7 +268,7 @@ def _shown_final(drawing: Drawing) -> Motion:
     if smoothed is None or truth is None:
         return drawing.shown
     try:
-        return _alignment(match(smoothed, truth, drawing.protocol.options), ("se3", "yaw"))[0]
+        return first_alignment(match(smoothed, truth, drawing.protocol.options), ("se3", "yaw"))[0]
     except MetricError:
         return drawing.shown
 
@@ -275,7 +277,7 @@ def draw_pose(drawing: Drawing) -> "Figure | None":
     """Position and orientation over time."""
     if len(drawing.states) == 0:
         return None
-    figure = _new_figure((11.0, 6.4))
+    figure = new_figure((11.0, 6.4))
     panels = figure.subplots(3, 2, sharex=True)
     curves = [(drawing.states.stamps_ns, drawing.upright.apply(drawing.states.T_world_body), "estimate, causal")]
     truth = _shown_truth(drawing)
@@ -287,7 +289,7 @@ def draw_pose(drawing: Drawing) -> "Figure | None":
     }
     reference = None
     for stamps_ns, poses, label in curves:
-        time_s, position = _with_breaks(drawing.time_s(stamps_ns), poses[:, :3, 3])
+        time_s, position = with_breaks(drawing.time_s(stamps_ns), poses[:, :3, 3])
         angles = _roll_pitch_yaw_deg(poses[:, :3, :3])
         if reference is not None:
             # Unwrapping starts anywhere: bring the curve to within half a turn of the truth where it begins.
@@ -296,7 +298,7 @@ def draw_pose(drawing: Drawing) -> "Figure | None":
             angles[:, 2] -= 360.0 * np.round((angles[0, 2] - at_start) / 360.0)
         else:
             reference = (drawing.time_s(stamps_ns), angles)
-        _, angles = _with_breaks(drawing.time_s(stamps_ns), angles)
+        _, angles = with_breaks(drawing.time_s(stamps_ns), angles)
         for axis in range(3):
             panels[axis, 0].plot(time_s, position[:, axis], label=label, **styles[label])
             panels[axis, 1].plot(time_s, angles[:, axis], **styles[label])
@@ -311,7 +313,7 @@ def draw_pose(drawing: Drawing) -> "Figure | None":
     for axes in panels[2]:
         axes.set_xlabel("time (s)")
     _legend(figure, panels[0, 0], drawing)
-    _caption(figure, drawing.caption(drawing.upright_name))
+    add_caption(figure, drawing.caption(drawing.upright_name))
     return figure
 
 
@@ -337,7 +339,7 @@ def draw_errors(drawing: Drawing) -> "Figure | None":
     errors = drawing.errors
     if errors is None or len(errors.stamps_ns) == 0:
         return None
-    figure = _new_figure((11.0, 6.4))
+    figure = new_figure((11.0, 6.4))
     panels = figure.subplots(3, 2, sharex=True)
     sigma = np.sqrt(np.maximum(np.diagonal(errors.covariance, axis1=1, axis2=2), 0.0))
     columns = (
@@ -355,14 +357,14 @@ def draw_errors(drawing: Drawing) -> "Figure | None":
     for axes in panels[2]:
         axes.set_xlabel("time (s)")
     _legend(figure, panels[0, 0], drawing)
-    _caption(figure, f"aligned: {drawing.protocol.nees_alignment} · {drawing.protocol.describe()}")
+    add_caption(figure, f"aligned: {drawing.protocol.nees_alignment} · {drawing.protocol.describe()}")
     return figure
 
 
 def _error_panel(
     axes: "Axes", drawing: Drawing, errors: StateErrors, values: Array, bound: Array, smallest: float
 ) -> None:
-    time_s, broken = _with_breaks(drawing.time_s(errors.stamps_ns), np.stack([values, bound], axis=1))
+    time_s, broken = with_breaks(drawing.time_s(errors.stamps_ns), np.stack([values, bound], axis=1))
     axes.axhline(0.0, color="#9a9a9a", linewidth=0.8)
     largest = max(float(np.abs(values).max()), 1e-12)
     limit = 1.25 * largest
@@ -389,11 +391,11 @@ def draw_biases(drawing: Drawing) -> "Figure | None":
     states = drawing.states
     if len(states) == 0 or (not states.bias.any() and not np.nan_to_num(states.bias_sigma).any()):
         return None
-    figure = _new_figure((11.0, 5.6))
+    figure = new_figure((11.0, 5.6))
     panels = figure.subplots(3, 2, sharex=True, sharey="col")
     for column, (part, factor, unit) in enumerate(((slice(0, 3), np.rad2deg(1.0), "°/s"), (slice(3, 6), 1.0, "m/s²"))):
         both = np.concatenate([states.bias[:, part], 3.0 * states.bias_sigma[:, part]], axis=1) * factor
-        time_s, broken = _with_breaks(drawing.time_s(states.stamps_ns), both)
+        time_s, broken = with_breaks(drawing.time_s(states.stamps_ns), both)
         for axis in range(3):
             axes = panels[axis, column]
             value, bound = broken[:, axis], broken[:, 3 + axis]
@@ -416,7 +418,7 @@ def draw_biases(drawing: Drawing) -> "Figure | None":
     panels[0, 0].set_title(f"{drawing.run.sequence}: gyro bias")
     panels[0, 1].set_title("Accelerometer bias")
     _legend(figure, panels[0, 0], drawing)
-    _caption(figure, drawing.protocol.describe())
+    add_caption(figure, drawing.protocol.describe())
     return figure
 
 
@@ -435,9 +437,9 @@ def draw_tracks(drawing: Drawing) -> "Figure | None":
     run = drawing.run
     if len(run.track_stamps_ns) == 0:
         return None
-    figure = _new_figure((7.4, 3.4))
+    figure = new_figure((7.4, 3.4))
     axes = figure.subplots()
-    time_s, counts = _with_breaks(drawing.time_s(run.track_stamps_ns), run.track_counts.astype(float))
+    time_s, counts = with_breaks(drawing.time_s(run.track_stamps_ns), run.track_counts.astype(float))
     axes.fill_between(time_s, 0, counts, color=ESTIMATE, alpha=0.15, linewidth=0)
     axes.plot(time_s, counts, color=ESTIMATE, linewidth=1.1)
     median = float(np.median(run.track_counts))
@@ -457,7 +459,7 @@ def draw_time(drawing: Drawing) -> "Figure | None":
     if table is None:
         return None
     total = table.pop("total")
-    figure = _new_figure((7.4, 3.4))
+    figure = new_figure((7.4, 3.4))
     axes = figure.subplots()
     names = list(table)
     values = np.array([table[name] for name in names])
@@ -481,7 +483,7 @@ def draw_frames(drawing: Drawing) -> "Figure | None":
     across = min(len(samples), 2)
     down = -(-len(samples) // across)
     height, width = samples[0].image.shape[:2]
-    figure = _new_figure((10.0, 10.0 / across * down * height / width + 0.22 * down + 0.25))
+    figure = new_figure((10.0, 10.0 / across * down * height / width + 0.22 * down + 0.25))
     panels = np.atleast_1d(figure.subplots(down, across)).ravel()
     for axes in panels:
         axes.set_axis_off()
@@ -495,7 +497,7 @@ def draw_frames(drawing: Drawing) -> "Figure | None":
         axes.set_ylim(shape[0] - 0.5, -0.5)
         time_s = float(drawing.time_s(np.array([sample.stamp_ns], dtype=np.int64))[0])
         axes.set_title(f"{time_s:.2f} s: {len(sample.ids)} tracks", fontsize=9.5, fontweight="normal")
-    _caption(figure, "colour: age of a point among those in the same frame, from dark (oldest) to bright (newest)")
+    add_caption(figure, "colour: age of a point among those in the same frame, from dark (oldest) to bright (newest)")
     return figure
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 from vioframe.errors import ConfigError
 from vioframe.evaluation.align import AssociationMethod
 
-Output = Literal["causal", "final"]
+Output = Literal["causal", "final", "file"]
 
 STATE_CHOICE = "tracking and lost"
 """Which states are compared: all but those from before the fuser had initialised itself. Leaving out ``lost``
@@ -59,10 +59,10 @@ class Protocol:
 
     Attributes:
         options: association tolerance, segment lengths and the like.
-        output: ``causal``, as given while running, or ``final``, smoothed afterwards.
+        output: ``causal``, as given while running, ``final``, smoothed afterwards, or ``file``, which does not say.
         rate_hz: of the poses compared, or None where there are none.
         truth_rate_hz: of the ground truth, or None.
-        init: how the fuser was started.
+        init: how the fuser was started; empty for a file.
         uses_ground_truth: parts that simulate a sensor from the truth.
         nees_alignment: what was aligned before errors were weighed with their covariance.
     """
@@ -89,7 +89,8 @@ class Protocol:
         if self.rate_hz is not None:
             words.append(f"{self.rate_hz:.3g} Hz")
         words.append(describe_association(self.options))
-        words.append(f"init={self.init}")
+        if self.init:
+            words.append(f"init={self.init}")
         if self.uses_ground_truth:
             words.append(f"simulated from the truth: {', '.join(self.uses_ground_truth)}")
         return " · ".join(words)

@@ -15,15 +15,16 @@ from vioframe.evaluation.rows import Row, metrics_document
 from vioframe.evaluation.run import SequenceRun
 from vioframe.evaluation.states import StateColumns
 from vioframe.evaluation.wording import (
-    CONSISTENCY,
-    RUNNING,
     UNDEFINED,
     Line,
     accuracy_lines,
     counter_text,
+    has_run,
     join,
+    output_name,
     protocol_text,
     reasons,
+    running_lines,
     show,
     significant,
 )
@@ -108,6 +109,7 @@ def make_report(
     config_yaml: str,
     options: EvaluationOptions,
     extra: Mapping[str, object] | None = None,
+    shared_figures: Mapping[str, Path] | None = None,
 ) -> str:
     """The page as HTML.
 
@@ -117,12 +119,14 @@ def make_report(
         config_yaml: the resolved configuration.
         options: of the metrics.
         extra: what ``metrics.json`` also says, such as the choice of parts.
+        shared_figures: those that show all sequences at once.
     """
     title = f"vioframe: {rows[0]['sequence']}" if len(rows) == 1 else f"vioframe: {len(rows)} sequences"
     body = [f"<h1>{escape(title)}</h1>", _parts_line(extra)]
     body += [_failure(row) for row in rows if row.get("error")]
     if len(rows) > 1:
         body.append(_overview(rows))
+    body += [_image(name, path) for name, path in (shared_figures or {}).items()]
     for number, (row, paths) in enumerate(zip(rows, figures, strict=True)):
         body.append(_sequence_section(row, paths, anchor=f"s{number}", heading=len(rows) > 1))
     body.append(_protocol_section(options))
@@ -152,25 +156,30 @@ def _failure(row: Row) -> str:
 
 def _overview(rows: Sequence[Row]) -> str:
     keys = (
-        "path_m", "ate_se3_m", "ate_se3_percent", "ate_sim3_m", "scale_error_percent", "t_rel_percent",
+        "path_m", "ate_m", "ate_se3_m", "ate_se3_percent", "ate_sim3_m", "scale_error_percent", "t_rel_percent",
         "r_rel_deg_per_100m", "anees_position", "anees_orientation", "completion", "real_time_factor",
     )  # fmt: skip
-    lines = [line for line in (*accuracy_lines(rows[0]), *CONSISTENCY, *RUNNING) if line.key in keys]
+    fullest = max(rows, key=len)
+    lines = [line for line in (*accuracy_lines(fullest), *running_lines(fullest)) if line.key in keys]
+    timed = "ms_per_frame" in fullest
     head = "".join(f"<th>{escape(line.short)}<br><small>{escape(line.unit)}</small></th>" for line in lines)
+    head += "<th>time<br><small>ms/frame</small></th>" if timed else ""
     table = [
         "<div class=scroll><table><thead><tr><th class=name>sequence</th>"
-        f"{head}<th>ms per frame</th><th>status</th></tr></thead><tbody>"
+        + head
+        + "<th>status</th></tr></thead><tbody>"
     ]
     for number, row in enumerate(rows):
         name = f"<a href='#s{number}'>{escape(str(row['sequence']))}</a>"
+        status = escape(str(row["status"]))
+        milliseconds = f"<td>{_total_ms(row)}</td>" if timed else ""
         table.append(
-            f"<tr><td class=name>{name}</td>{_cells(row, lines)}<td>{_total_ms(row)}</td>"
-            f"<td class={escape(str(row['status']))}>{escape(str(row['status']))}</td></tr>"
+            f"<tr><td class=name>{name}</td>{_cells(row, lines)}{milliseconds}<td class={status}>{status}</td></tr>"
         )
         final = row.get("final")
         if isinstance(final, Mapping):
             accuracy = [line for line in lines if line.key in final]
-            rest = "<td></td>" * (len(lines) - len(accuracy) + 2)
+            rest = "<td></td>" * (len(lines) - len(accuracy) + 1 + timed)
             table.append(f"<tr class=final><td class=name>final</td>{_cells(final, accuracy)}{rest}</tr>")
     return "".join(table) + "</tbody></table></div>"
 
@@ -191,7 +200,9 @@ def _value(row: Mapping[str, object], line: Line) -> str:
 
 def _total_ms(row: Row) -> str:
     parts = row.get("ms_per_frame")
-    return significant(float(parts["total"])) if isinstance(parts, Mapping) else UNDEFINED
+    if isinstance(parts, Mapping):
+        return significant(float(parts["total"]))
+    return f"<span class=undefined>{UNDEFINED}</span>"
 
 
 def _sequence_section(row: Row, figures: Mapping[str, Path], *, anchor: str, heading: bool) -> str:
@@ -201,22 +212,25 @@ def _sequence_section(row: Row, figures: Mapping[str, Path], *, anchor: str, hea
     counted = counter_text(row)
     if counted:
         html.append(f"<p class=counters>{escape(counted)}</p>")
-    if row.get("windows"):
+    if has_run(row):
         html.append(f"<div class=columns>{_accuracy_table(row)}{_running_table(row)}</div>")
         for reason, labels in reasons(row).items():
             html.append(f"<p class=note>Undefined: {escape(join(labels))} ({escape(reason)}).</p>")
         html.append(f"<p class=note>{escape(protocol_text(row))}</p>")
-    for title, path in figures.items():
-        data = base64.b64encode(path.read_bytes()).decode("ascii")
-        width = _WIDTHS.get(title, "full")
-        html.append(f"<img class={width} alt='{escape(title, quote=True)}' src='data:image/png;base64,{data}'>")
+    html += [_image(title, path) for title, path in figures.items()]
     return "\n".join([*html, "</section>"])
+
+
+def _image(title: str, path: Path) -> str:
+    data = base64.b64encode(path.read_bytes()).decode("ascii")
+    width = _WIDTHS.get(title, "full")
+    return f"<img class={width} alt='{escape(title, quote=True)}' src='data:image/png;base64,{data}'>"
 
 
 def _accuracy_table(row: Row) -> str:
     final = row.get("final")
     outputs: list[Mapping[str, object]] = [row, final] if isinstance(final, Mapping) else [row]
-    names = "".join(f"<th>{name}</th>" for name in ("causal", "final")[: len(outputs)])
+    names = "".join(f"<th>{escape(output_name(output))}</th>" for output in outputs)
     lines = [f"<table><thead><tr><th class=name>accuracy</th>{names}<th></th></tr></thead><tbody>"]
     for line in accuracy_lines(row):
         cells = "".join(f"<td>{_value(output, line)}</td>" for output in outputs)
@@ -225,8 +239,10 @@ def _accuracy_table(row: Row) -> str:
 
 
 def _running_table(row: Row) -> str:
+    if not running_lines(row):
+        return ""
     lines = ["<table><thead><tr><th class=name>consistency and running</th><th></th><th></th></tr></thead><tbody>"]
-    for line in (*CONSISTENCY, *RUNNING):
+    for line in running_lines(row):
         lines.append(
             f"<tr><td class=name>{escape(line.label)}</td><td>{_value(row, line)}</td>"
             f"<td class=unit>{escape(line.unit)}</td></tr>"
@@ -234,7 +250,8 @@ def _running_table(row: Row) -> str:
     entries: list[tuple[str, str, str]] = []
     parts = row.get("ms_per_frame")
     if isinstance(parts, Mapping):
-        entries += [("time per frame" if p == "total" else p, significant(float(ms)), "ms") for p, ms in parts.items()]
+        entries += [("time per frame", significant(float(parts["total"])), "ms")]
+        entries += [(f"\u2003{part}", significant(float(ms)), "ms") for part, ms in parts.items() if part != "total"]
     states = row.get("states")
     if isinstance(states, Mapping):
         entries += [(f"states {status}", str(count), "") for status, count in states.items()]

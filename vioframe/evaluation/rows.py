@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -10,7 +11,7 @@ from vioframe.checks import Stamps
 from vioframe.conventions import NANOSECONDS
 from vioframe.errors import MetricError
 from vioframe.evaluation import metrics
-from vioframe.evaluation.align import Alignment, MatchedPoses, associate, path_length
+from vioframe.evaluation.align import Alignment, MatchedPoses, align, associate, path_length
 from vioframe.evaluation.protocol import EvaluationOptions, Output, Protocol, describe_options
 from vioframe.evaluation.run import SequenceRun
 from vioframe.evaluation.states import StateColumns
@@ -122,7 +123,9 @@ def rate_hz(stamps_ns: Stamps) -> float | None:
     return NANOSECONDS / float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else None
 
 
-def match(estimate: Trajectory, truth: Trajectory | None, options: EvaluationOptions) -> MatchedPoses:
+def match(
+    estimate: Trajectory, truth: Trajectory | None, options: EvaluationOptions, *, offset_s: float = 0.0
+) -> MatchedPoses:
     """:func:`~vioframe.evaluation.align.associate` with the user's options.
 
     Raises:
@@ -141,15 +144,50 @@ def match(estimate: Trajectory, truth: Trajectory | None, options: EvaluationOpt
         method=options.association,
         max_gap_s=options.max_gap_s,
         max_difference_s=options.max_difference_s,
+        offset_s=offset_s,
     )
 
 
-def _accuracy(estimate: Trajectory, truth: Trajectory | None, options: EvaluationOptions) -> _Cells:
-    """Every metric that two trajectories suffice for."""
+def compare_trajectories(
+    estimate: Trajectory, truth: Trajectory, options: EvaluationOptions, *, alignment: Alignment, offset_s: float = 0.0
+) -> Row:
+    """The metrics of two trajectories from anywhere, for ``task=evaluate``.
+
+    Args:
+        estimate, truth: on one clock, up to ``offset_s``.
+        options: association and segments.
+        alignment: of ``ate_m``; with ``sim3`` the estimate is scaled before any other error is taken, and only
+            with ``yaw``, which says that both worlds have z up, there are errors of yaw and gravity.
+        offset_s: added to the stamps of the estimate.
+
+    Raises:
+        MetricError: nothing matches.
+    """
+    matched = match(estimate, truth, options, offset_s=offset_s)
+    cells = _accuracy(estimate, truth, options, offset_s=offset_s, scaled=alignment == "sim3")
+    asked = ("ate_m", "ate_mean_m", "ate_median_m", "ate_max_m")
+    cells.add(asked, lambda: _statistics(matched, alignment))
+    # In the worlds of these files z may point anywhere.
+    upright = ("ate_yaw_m", "yaw_rmse_deg", "gravity_rmse_deg", "gravity_max_deg")
+    names = [name for name in cells.values if alignment == "yaw" or name not in upright]
+    leading = ("path_estimated_m", "poses", "path_m", *asked)
+    values = {name: cells.values[name] for name in (*leading, *names)}
+    return {**values, "undefined": {name: reason for name, reason in cells.undefined.items() if name in values}}
+
+
+def _accuracy(
+    estimate: Trajectory,
+    truth: Trajectory | None,
+    options: EvaluationOptions,
+    *,
+    offset_s: float = 0.0,
+    scaled: bool = False,
+) -> _Cells:
+    """Every metric that two trajectories suffice for; ``scaled`` brings relative errors to the scale of the truth."""
     cells = _Cells()
     reason, matched = "", None
     try:
-        matched = match(estimate, truth, options)
+        matched = match(estimate, truth, options, offset_s=offset_s)
     except MetricError as error:
         reason = str(error)
 
@@ -167,24 +205,39 @@ def _accuracy(estimate: Trajectory, truth: Trajectory | None, options: Evaluatio
     add(["ate_yaw_m"], lambda m: [metrics.absolute_error(m, "yaw")[0].rmse])
     add(["ate_sim3_m", "sim3_scale"], _sim3)
     add(["scale_error_percent"], lambda m: [metrics.scale_error_percent(_sim3(m)[1])])
+
+    def add_relative(names: Sequence[str], compute: Callable[[MatchedPoses], Sequence[float]]) -> None:
+        add(names, lambda m: compute(_scaled(m) if scaled else m))
+
     for distance in options.rpe_distances_m:
-        add(
+        add_relative(
             [f"rpe_trans_percent_{distance:g}m", f"rpe_rot_deg_{distance:g}m"],
             partial(_rpe_by_distance, distance_m=distance),
         )
     for duration in options.rpe_times_s:
-        add(
+        add_relative(
             [f"rpe_trans_m_{duration:g}s", f"rpe_rot_deg_{duration:g}s"],
             partial(_rpe_by_time, duration_s=duration),
         )
-    add(["t_rel_percent", "r_rel_deg_per_100m"], lambda m: _segments(m, options))
+    add_relative(["t_rel_percent", "r_rel_deg_per_100m"], lambda m: _segments(m, options))
     add(["yaw_rmse_deg"], lambda m: [_rms_deg(metrics.yaw_errors(m))])
     add(["gravity_rmse_deg", "gravity_max_deg"], _gravity)
     cells.values["segments"] = {}
     if matched is not None and cells.values["t_rel_percent"] is not None:
-        errors = metrics.segment_errors(matched, options.segment_lengths_m, options.segment_step)
-        cells.values["segments"] = errors.by_length()
+        poses = _scaled(matched) if scaled else matched
+        cells.values["segments"] = metrics.segment_errors(
+            poses, options.segment_lengths_m, options.segment_step
+        ).by_length()
     return cells
+
+
+def _scaled(matched: MatchedPoses) -> MatchedPoses:
+    """The estimate laid over the truth by Sim(3).
+
+    Raises:
+        MetricError: the positions do not determine it.
+    """
+    return replace(matched, T_estimate=align(matched, "sim3").apply(matched.T_estimate))
 
 
 def _statistics(matched: MatchedPoses, alignment: Alignment) -> list[float]:

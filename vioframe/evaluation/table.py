@@ -6,15 +6,16 @@ from typing import TYPE_CHECKING
 
 from vioframe.evaluation.rows import Row
 from vioframe.evaluation.wording import (
-    CONSISTENCY,
-    RUNNING,
     UNDEFINED,
     Line,
     accuracy_lines,
     counter_text,
+    has_run,
     join,
+    output_name,
     protocol_text,
     reasons,
+    running_lines,
     show,
     significant,
 )
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 _WIDE_KEYS = (
     "path_m",
+    "ate_m",
     "ate_se3_m",
     "ate_se3_percent",
     "ate_sim3_m",
@@ -62,7 +64,9 @@ def render_rows(rows: Sequence[Row]) -> "list[RenderableType]":
     if len(rows) == 1:
         parts += [_single(rows[0])]
     elif rows:
-        parts += [_many_accuracy(rows), _many_running(rows)]
+        parts += [_many_accuracy(rows)]
+        if running_lines(max(rows, key=len)):
+            parts += [_many_running(rows)]
     for row in rows:
         parts += _notes(row, name=len(rows) > 1)
     return parts + _protocols(rows)
@@ -84,10 +88,10 @@ def _cell(text: str) -> "Text":
 def _single(row: Row) -> "Table":
     table = _new_table(f"{row['sequence']}: {row['status']}")
     final = row.get("final")
-    outputs = [row, final] if isinstance(final, Mapping) else [row]
+    outputs: list[Mapping[str, object]] = [row, final] if isinstance(final, Mapping) else [row]
     table.add_column("")
-    for name in ("causal", "final")[: len(outputs)]:
-        table.add_column(name, justify="right")
+    for output in outputs:
+        table.add_column(output_name(output), justify="right")
     table.add_column("", style="dim")
 
     def add(label: str, values: Sequence[str], unit: str) -> None:
@@ -97,7 +101,7 @@ def _single(row: Row) -> "Table":
     for line in accuracy_lines(row):
         add(line.label, [show(output, line, unit=False) for output in outputs], line.unit)
     table.add_section()
-    for line in (*CONSISTENCY, *RUNNING):
+    for line in running_lines(row):
         add(line.label, [show(row, line, unit=False)], line.unit)
     parts = row.get("ms_per_frame")
     if isinstance(parts, Mapping):
@@ -110,8 +114,8 @@ def _single(row: Row) -> "Table":
 
 
 def _many_accuracy(rows: Sequence[Row]) -> "Table":
-    lines = [line for line in accuracy_lines(rows[0]) if line.key in _WIDE_KEYS]
-    table = _with_columns("Accuracy (causal)", lines)
+    lines = [line for line in accuracy_lines(max(rows, key=len)) if line.key in _WIDE_KEYS]
+    table = _with_columns("Accuracy", lines)
     for row in rows:
         table.add_row(_cell(str(row["sequence"])), *(_cell(show(row, line, unit=False)) for line in lines))
         final = row.get("final")
@@ -121,7 +125,7 @@ def _many_accuracy(rows: Sequence[Row]) -> "Table":
 
 
 def _many_running(rows: Sequence[Row]) -> "Table":
-    lines = [*RUNNING, *CONSISTENCY]
+    lines = running_lines(max(rows, key=len))
     table = _with_columns("Running and consistency", lines)
     table.add_column("ms per\nframe", justify="right")
     table.add_column("status")
@@ -152,7 +156,7 @@ def _notes(row: Row, *, name: bool) -> "list[RenderableType]":
     counted = counter_text(row)
     if counted:
         notes.append(Text(f"{prefix}{counted}", style="yellow"))
-    if row.get("windows"):
+    if has_run(row):
         # Where nothing ran, the error has said everything.
         for reason, labels in reasons(row).items():
             notes.append(Text(f"{prefix}undefined: {join(labels)} ({reason})", style="dim"))
@@ -165,7 +169,7 @@ def _protocols(rows: Sequence[Row]) -> "list[RenderableType]":
 
     by_text: dict[str, list[str]] = {}
     for row in rows:
-        if row.get("windows"):
+        if has_run(row):
             by_text.setdefault(protocol_text(row), []).append(str(row["sequence"]))
     if len(by_text) == 1:
         return [Text(text, style="dim") for text in by_text]

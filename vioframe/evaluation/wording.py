@@ -28,6 +28,10 @@ class Line:
 
 _FIXED = (
     Line(key="path_m", label="path", short="path", unit="m"),
+    Line(key="ate_m", label="ATE, rms", short="ATE", unit="m", digits=7),
+    Line(key="ate_mean_m", label="ATE, mean", short="mean", unit="m", digits=7),
+    Line(key="ate_median_m", label="ATE, median", short="median", unit="m", digits=7),
+    Line(key="ate_max_m", label="ATE, maximum", short="max.", unit="m", digits=7),
     Line(key="ate_se3_m", label="ATE, SE(3) aligned", short="ATE SE(3)", unit="m"),
     Line(key="ate_se3_percent", label="ATE, SE(3), of the path", short="ATE", unit="%"),
     Line(key="ate_yaw_m", label="ATE, yaw aligned", short="ATE yaw", unit="m"),
@@ -35,16 +39,16 @@ _FIXED = (
     Line(key="scale_error_percent", label="scale error", short="scale err.", unit="%", signed=True),
 )
 _DRIFT = (
-    Line(key="t_rel_percent", label="t_rel (KITTI)", short="t_rel", unit="%"),
-    Line(key="r_rel_deg_per_100m", label="r_rel (KITTI)", short="r_rel", unit="°/100 m"),
+    Line(key="t_rel_percent", label="t_rel (KITTI)", short="t_rel", unit="%", digits=4),
+    Line(key="r_rel_deg_per_100m", label="r_rel (KITTI)", short="r_rel", unit="°/100 m", digits=4),
     Line(key="yaw_rmse_deg", label="yaw error", short="yaw", unit="°"),
     Line(key="gravity_rmse_deg", label="gravity direction error", short="gravity", unit="°"),
 )
-CONSISTENCY = (
+_CONSISTENCY = (
     Line(key="anees_position", label="ANEES per DoF, position", short="ANEES pos.", unit=""),
     Line(key="anees_orientation", label="ANEES per DoF, orientation", short="ANEES ori.", unit=""),
 )
-RUNNING = (
+_RUNNING = (
     Line(key="completion", label="completion", short="complete", unit="%", factor=100.0, digits=4),
     Line(key="real_time_factor", label="real-time factor", short="real time", unit="×"),
 )
@@ -53,7 +57,18 @@ _RPE_PATTERN = re.compile(r"rpe_(?P<what>trans_percent|rot_deg|trans_m)_(?P<leng
 
 def accuracy_lines(row: Mapping[str, object]) -> list[Line]:
     """The metrics that compare with the truth, in the order of print; RPE as the options asked for it."""
-    return [*_FIXED, *(line for key in row if (line := _rpe_line(key)) is not None), *_DRIFT]
+    rpe = (line for key in row if (line := _rpe_line(key)) is not None)
+    return [line for line in (*_FIXED, *rpe, *_DRIFT) if line.key in row]
+
+
+def running_lines(row: Mapping[str, object]) -> list[Line]:
+    """The metrics of a run as such, in the order of print."""
+    return [line for line in (*_CONSISTENCY, *_RUNNING) if line.key in row]
+
+
+def has_run(row: Mapping[str, object]) -> bool:
+    """Whether anything was processed; where nothing was, the error of the row says it all."""
+    return row.get("windows") != 0
 
 
 def _rpe_line(key: str) -> Line | None:
@@ -98,7 +113,7 @@ def reasons(row: Mapping[str, object]) -> dict[str, list[str]]:
     undefined = row.get("undefined")
     if not isinstance(undefined, Mapping):
         return {}
-    labels = {line.key: line.label for line in (*accuracy_lines(row), *CONSISTENCY, *RUNNING)}
+    labels = {line.key: line.label for line in (*accuracy_lines(row), *running_lines(row))}
     by_reason: dict[str, list[str]] = {}
     for key, reason in undefined.items():
         if key in labels:
@@ -122,6 +137,12 @@ def counter_text(row: Mapping[str, object]) -> str:
     return ", ".join(f"{name}: {count}" for name, count in counters.items())
 
 
+def output_name(row: Mapping[str, object]) -> str:
+    """``causal``, ``final``, or ``file`` where only its author knows."""
+    protocol = row.get("protocol")
+    return str(protocol.get("output", "")) if isinstance(protocol, Mapping) else ""
+
+
 def protocol_text(row: Mapping[str, object]) -> str:
     """How the causal numbers of a row were measured, in one line."""
     protocol = row.get("protocol")
@@ -131,10 +152,15 @@ def protocol_text(row: Mapping[str, object]) -> str:
     rate = protocol.get("rate_hz")
     if isinstance(rate, int | float):
         words.append(f"{rate:.3g} Hz")
-    words.append(f"init={protocol.get('init')}")
     used = protocol.get("uses_ground_truth")
+    for name, text in (
+        ("alignment", "{} alignment"),
+        ("init", "init={}"),
+        ("states", "states {}"),
+        ("nees_alignment", "ANEES aligned: {}"),
+    ):
+        if protocol.get(name):
+            words.append(text.format(protocol[name]))
     if isinstance(used, list) and used:
         words.append(f"simulated from the truth: {', '.join(map(str, used))}")
-    words.append(f"states {protocol.get('states')}")
-    words.append(f"ANEES aligned: {protocol.get('nees_alignment')}")
     return " · ".join(words)
