@@ -2,6 +2,7 @@
 
 from vioframe_recordings.euroc import EurocDataset
 from vioframe_recordings.kitti import KittiDataset
+from vioframe_recordings.kitti_raw import KittiRawDataset
 from vioframe_recordings.tumvi import TumviDataset
 
-__all__ = ["EurocDataset", "KittiDataset", "TumviDataset"]
+__all__ = ["EurocDataset", "KittiDataset", "KittiRawDataset", "TumviDataset"]

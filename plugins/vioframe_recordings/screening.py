@@ -45,8 +45,8 @@ def check_samples(imu: ImuBlock, where: str, rate_hz: float) -> list[Finding]:
         if offset > LARGEST_QUIET_RATE:
             raise DataError(
                 f"{where}: the gyro reads {offset:.2f} rad/s on average at stamp {int(imu.stamps_ns[quiet[0]])} while "
-                "the accelerometer reads one constant vector, as at rest, so these look like degrees per second: convert "
-                "them to rad/s"
+                "the accelerometer reads one constant vector, as at rest, so these look like degrees per second: "
+                "convert them to rad/s"
             )
     findings.append(
         Finding(level="good", subject="gyro unit", text=f"rad/s: the fastest rate is {fastest:.2f} rad/s")
