@@ -29,14 +29,17 @@ def import_mlflow(timeout_s: float = 5.0) -> Any:
     Args:
         timeout_s: how long one request to a server may take.
     """
-    # Without these MLflow reports usage to its makers, and retries a dead server for minutes.
+    # Without these MLflow reports usage to its makers, prints addresses, and retries a dead server for minutes.
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     os.environ.setdefault("DO_NOT_TRACK", "true")
+    os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", str(max(10, round(timeout_s))))
     quiet = "MLFLOW_LOGGING_LEVEL" not in os.environ
     # Comes along with pandas and tells its number of threads on import.
     logging.getLogger("numexpr").setLevel(logging.WARNING)
+    # Warns of every retry, before the failure that is told here.
+    logging.getLogger("urllib3.connectionpool").setLevel(logging.ERROR)
     import mlflow
     import mlflow.tracking
 

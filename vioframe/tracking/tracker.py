@@ -306,14 +306,17 @@ class MlflowTracker(Tracker):
         try:
             action()
         except client_errors() as error:
-            refused = getattr(error, "error_code", "") in ("INVALID_PARAMETER_VALUE", "BAD_REQUEST")
+            # MLflow's BAD_REQUEST will not do: it says that of a broken database too.
+            refused = getattr(error, "error_code", "") == "INVALID_PARAMETER_VALUE"
             missing = isinstance(error, FileNotFoundError | NotADirectoryError)
             self._lost = not (refused or missing)
+            # An HTTP client's message is a paragraph; asking again gives the reason in two words.
+            reason = why_unreachable(self._uri, self._timeout_s) if self._lost else None
             log.warning(
                 "MLflow at %s did not take %s (%s)%s",
                 hide_password(self._uri),
                 what,
-                one_sentence(error),
+                reason or one_sentence(error),
                 ": nothing more is recorded there; the results are in the output folder" if self._lost else "",
             )
 
