@@ -414,6 +414,15 @@ class InertialFilter:
         sigmas = np.repeat([rotation_sigma, position_sigma, velocity_sigma], 3)
         return H, residual, np.diag(sigmas**2)
 
+    def doubt(self, tilt_sigma: float, velocity_sigma: float) -> None:
+        """Admit to be wrong by more than the covariance says: widen roll, pitch (rad) and velocity (m/s)."""
+        local = np.zeros((SIZE, SIZE))
+        upright = np.diag([tilt_sigma**2, tilt_sigma**2, 0.0])
+        local[THETA, THETA] = self.body.R.T @ upright @ self.body.R
+        local[VELOCITY, VELOCITY] = velocity_sigma**2 * np.eye(3)
+        into = invariant_from_local(self.body)
+        self.covariance[INERTIAL, INERTIAL] += symmetrised(into @ local @ into.T)
+
     def nav_state(self, stamp_ns: int, status: Status) -> NavState:
         """The state in the convention of :class:`~vioframe.types.NavState`."""
         into = local_from_invariant(self.body)

@@ -34,6 +34,9 @@ from vioframe.types import (
     SyncedWindow,
 )
 
+# Rounding turns a rotation off the group by about 1e-16 a window.
+_NORMALISE_EVERY = 1000
+
 
 def _check_positive(group: str, **values: float) -> None:
     for name, value in values.items():
@@ -87,6 +90,9 @@ class VisualOptions:
         gate_probability: a relative pose is used if its χ² is one that a true one stays below with this
             probability; 1 uses all.
         lost_after_s: seconds without a used one, moving, after which the status is ``lost``.
+        recover_after_s: seconds of refusing all of them after which the filter doubts itself instead.
+        recover_tilt_sigma: rad, what is then added to roll and pitch.
+        recover_velocity_sigma: m/s, what is then added to the velocity.
     """
 
     covariance_scale: float = 1.0
@@ -95,6 +101,9 @@ class VisualOptions:
     translation_ratio: float = 0.02
     gate_probability: float = 0.9999
     lost_after_s: float = 1.0
+    recover_after_s: float = 1.0
+    recover_tilt_sigma: float = 0.02
+    recover_velocity_sigma: float = 1.0
 
     def __post_init__(self) -> None:
         _check_positive(
@@ -102,9 +111,14 @@ class VisualOptions:
             covariance_scale=self.covariance_scale,
             rotation_sigma=self.rotation_sigma,
             lost_after_s=self.lost_after_s,
+            recover_after_s=self.recover_after_s,
         )
         _check_not_negative(
-            "visual", translation_sigma=self.translation_sigma, translation_ratio=self.translation_ratio
+            "visual",
+            translation_sigma=self.translation_sigma,
+            translation_ratio=self.translation_ratio,
+            recover_tilt_sigma=self.recover_tilt_sigma,
+            recover_velocity_sigma=self.recover_velocity_sigma,
         )
         if self.translation_sigma == 0.0 and self.translation_ratio == 0.0:
             raise ConfigError(
@@ -305,8 +319,11 @@ class LooseFuser(Fuser):
         self._rest = self._start.at_rest(rig)
         self._standstill_test = self._standstill.test(rig)
         self._given: NavState | None = None
-        self._stamp_ns: int | None = None
+        self._begun = False
+        self._stamp_ns = 0
         self._supported_ns = 0
+        self._refused_s = 0.0
+        self._windows = 0
         self._counts: dict[str, int] = {}
         self._ready = True
         self._filter = self._new_filter()
@@ -329,7 +346,7 @@ class LooseFuser(Fuser):
             raise StateError(f"{type(self).__name__}.update was called before setup(rig): set the fuser up first")
         window = measurement.window
         states = []
-        if self._stamp_ns is None:
+        if not self._begun:
             if self._given is None:
                 state = self._rest.push(window)
                 if state is not None:
@@ -339,16 +356,19 @@ class LooseFuser(Fuser):
             states.append(self._begin(self._given, covariance, window.previous.stamp_ns))
             self._given = None
         step = self._prepare(measurement)
-        if self._advance(step):
-            self._supported_ns = step.current_ns
+        self._account(step, self._advance(step))
         self._stamp_ns = step.current_ns
+        self._windows += 1
+        if self._windows % _NORMALISE_EVERY == 0:
+            self._filter.normalise()
         states.append(self._emit(self._status()))
         return states
 
     def _begin(self, state: NavState, covariance: Array, stamp_ns: int) -> NavState:
         self._filter.start(state, covariance)
+        self._begun = True
         self._stamp_ns = self._supported_ns = stamp_ns
-        self._started(stamp_ns)
+        self._started()
         return self._emit(self._status())
 
     def _prepare(self, measurement: Measurement) -> Step:
@@ -378,8 +398,7 @@ class LooseFuser(Fuser):
     def _coast_to(self, window: SyncedWindow) -> None:
         """Cross a stretch for which no window came."""
         self._count("missing windows")
-        last_ns = self._stamp_ns if self._stamp_ns is not None else window.previous.stamp_ns
-        duration = seconds(window.previous.stamp_ns - last_ns)
+        duration = seconds(window.previous.stamp_ns - self._stamp_ns)
         options = self._inertial
         delta = coasting(
             self._filter.body, duration, self._filter.gravity, options.gap_rate_sigma, options.gap_accel_sigma
@@ -399,21 +418,34 @@ class LooseFuser(Fuser):
         self._count("standstill updates")
         return True
 
+    def _account(self, step: Step, supported: bool) -> None:
+        """Keep count of how long measurements have been missing or refused."""
+        if supported:
+            self._supported_ns = step.current_ns
+            self._refused_s = 0.0
+        elif step.motion is not None:
+            self._refused_s += step.delta.duration_s
+        if self._refused_s > self._visual.recover_after_s:
+            # Odometry that disagrees all the time is more likely right than a filter that never looks.
+            self._filter.doubt(self._visual.recover_tilt_sigma, self._visual.recover_velocity_sigma)
+            self._count("recoveries")
+            self._refused_s = 0.0
+
     def _count(self, what: str) -> None:
         self._counts[what] = self._counts.get(what, 0) + 1
 
     def _status(self) -> Status:
-        elapsed = seconds((self._stamp_ns or 0) - self._supported_ns)
+        elapsed = seconds(self._stamp_ns - self._supported_ns)
         return "lost" if elapsed > self._visual.lost_after_s else "tracking"
 
     def _emit(self, status: Status) -> NavState:
-        return self._filter.nav_state(self._stamp_ns or 0, status)
+        return self._filter.nav_state(self._stamp_ns, status)
 
     def _new_filter(self) -> InertialFilter:
         """A filter with the errors that the plugin appends."""
         return InertialFilter(extra=0, noise=self._noise, gravity=self._gravity)
 
-    def _started(self, stamp_ns: int) -> None:
+    def _started(self) -> None:
         """The filter has just taken its first state."""
 
     def _correct(self, H: Array, residual: Array, noise: Array) -> None:

@@ -1,0 +1,289 @@
+"""Inertial propagation corrected by relative poses of unknown scale, drifting and late."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from vioframe.checks import Array
+from vioframe.error_state import part_of
+from vioframe.errors import ConfigError
+from vioframe.interfaces import CONSISTENT_SCALE, INERTIAL_DELTA, RELATIVE_POSE
+from vioframe.loose_fusion import (
+    InertialOptions,
+    LooseFuser,
+    StandstillOptions,
+    StartOptions,
+    Step,
+    VisualMotion,
+    VisualOptions,
+)
+from vioframe.types import InertialDelta, NavState, Status
+
+from vioframe_msf.search import ScaleSearch
+from vioframe_msf.state import ScaledFilter
+
+_SAME_TIME_S = 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScaleOptions:
+    """How the unit of the VO is found and followed.
+
+    Attributes:
+        guess: metres per unit, middle of the range that is searched.
+        ratio: the range goes from guess/ratio to guess·ratio.
+        known_sigma: relative standard deviation at which the scale counts as known.
+        known_probability: of one answer against all others, at which it counts as known.
+        walk: 1/√s, drift of its logarithm.
+        kept_by_vo: the VO keeps its unit through an interruption; if not, it is searched again after each.
+    """
+
+    guess: float = 1.0
+    ratio: float = 30.0
+    known_sigma: float = 0.1
+    known_probability: float = 0.99
+    walk: float = 0.002
+    kept_by_vo: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("guess", "known_sigma"):
+            if not getattr(self, name) > 0.0:
+                raise ConfigError(f"fuser.scale.{name} must be positive, got {getattr(self, name)}")
+        if not self.ratio >= 1.0:
+            raise ConfigError(f"fuser.scale.ratio must be at least 1, got {self.ratio}")
+        if not 0.0 < self.known_probability < 1.0:
+            raise ConfigError(f"fuser.scale.known_probability must be in (0, 1), got {self.known_probability}")
+        if not self.walk >= 0.0:
+            raise ConfigError(f"fuser.scale.walk must not be negative, got {self.walk}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DriftOptions:
+    """How the error of the VO is made up.
+
+    Attributes:
+        share: part of a relative pose's covariance that stays for ever as drift of the vision's frame; the
+            rest is the error of single images, which the next relative pose takes back. 1 for an odometer
+            whose errors are independent from step to step, less for one that locates itself in a map.
+    """
+
+    share: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.share <= 1.0:
+            raise ConfigError(
+                f"fuser.drift.share must be in (0, 1], got {self.share}; 0 would be a VO that never drifts"
+            )
+
+    def split(self, covariance: Array) -> tuple[Array, Array]:
+        """Covariances (6, 6) of the drift of a step and of one image; a step has two images."""
+        return self.share * covariance, 0.5 * (1.0 - self.share) * covariance
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExtrinsicsOptions:
+    """How far the calibrated place of the camera on the body may be off; zeros fix it.
+
+    Attributes:
+        rotation_sigma: rad an axis.
+        position_sigma: m an axis.
+    """
+
+    rotation_sigma: float = 0.0
+    position_sigma: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("rotation_sigma", "position_sigma"):
+            if not getattr(self, name) >= 0.0:
+                raise ConfigError(f"fuser.extrinsics.{name} must not be negative, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LateStep:
+    """A window at the time that the vision speaks of: increments in a row, the camera's motion over them, rest."""
+
+    deltas: tuple[InertialDelta, ...]
+    motion: VisualMotion | None
+    at_rest: bool
+
+
+class MsfFuser(LooseFuser):
+    """Filter with scale, vision-frame drift, camera extrinsics and delayed measurements; see the README.
+
+    Args:
+        visual: trust in the relative poses.
+        inertial: trust in the inertial increments.
+        standstill: measuring no motion at rest.
+        start: what is assumed of the first state.
+        scale: how the VO's unit is found and followed.
+        drift: how the VO's error is made up.
+        extrinsics: how far the camera's calibrated place may be off.
+        delay_s: a relative pose between two stamps tells the motion between the instants this much earlier.
+
+    Raises:
+        ConfigError: an option outside its range.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({INERTIAL_DELTA, RELATIVE_POSE, CONSISTENT_SCALE})
+    _filter: ScaledFilter
+
+    def __init__(
+        self,
+        *,
+        visual: VisualOptions | None = None,
+        inertial: InertialOptions | None = None,
+        standstill: StandstillOptions | None = None,
+        start: StartOptions | None = None,
+        scale: ScaleOptions | None = None,
+        drift: DriftOptions | None = None,
+        extrinsics: ExtrinsicsOptions | None = None,
+        delay_s: float = 0.0,
+    ) -> None:
+        super().__init__(visual=visual, inertial=inertial, standstill=standstill, start=start)
+        if not delay_s >= 0.0:
+            raise ConfigError(
+                f"fuser.delay_s must not be negative, got {delay_s}: a measurement cannot tell the future; "
+                "a constant offset of the clocks belongs to the synchronizer"
+            )
+        self._scale = scale or ScaleOptions()
+        self._drift = drift or DriftOptions()
+        self._extrinsics = extrinsics or ExtrinsicsOptions()
+        self._delay_s = delay_s
+        self._gate = self._visual.gate(6)
+
+    @property
+    def scale(self) -> float:
+        """Estimated metres per unit of the VO; meaningless while the status is ``starting``."""
+        return self._filter.scale
+
+    @property
+    def scale_sigma(self) -> float:
+        """Standard deviation of the scale, relative."""
+        return self._filter.scale_sigma
+
+    def _new_filter(self) -> ScaledFilter:
+        return ScaledFilter(
+            noise=self._noise,
+            gravity=self._gravity,
+            T_body_cam=self._T_body_cam,
+            extrinsics_sigmas=(self._extrinsics.rotation_sigma, self._extrinsics.position_sigma),
+        )
+
+    def _started(self) -> None:
+        self._pending: list[InertialDelta] = []
+        self._behind_s = 0.0
+        self._was_known = False
+        self._search: ScaleSearch | None = None
+        self._look_for_scale(self._scale.guess)
+
+    def _status(self) -> Status:
+        return super()._status() if self._was_known else "starting"
+
+    def _emit(self, status: Status) -> NavState:
+        if not self._pending:
+            return super()._emit(status)
+        ahead = self._filter.copy()
+        for delta in self._pending:
+            ahead.propagate(delta)
+        return ahead.nav_state(self._stamp_ns, status)
+
+    def _advance(self, step: Step) -> bool:
+        late = self._delayed(step)
+        if late is None:
+            return False
+        if step.motion is None and not self._scale.kept_by_vo and self._filter.T_world_vision is not None:
+            self._look_for_scale(self._filter.scale)
+        return self._track(late) if self._search is None else self._track_all(late, self._search)
+
+    def _delayed(self, step: Step) -> LateStep | None:
+        """What the VO's late motion spans: the inertial increments up to then; None before the first state."""
+        if self._delay_s == 0.0:
+            return LateStep(deltas=(step.delta,), motion=step.motion, at_rest=step.at_rest)
+        whole = self._behind_s >= self._delay_s - _SAME_TIME_S
+        self._pending.append(step.delta)
+        self._behind_s += step.delta.duration_s
+        if self._behind_s <= self._delay_s + _SAME_TIME_S:
+            return None
+        deltas = []
+        while self._behind_s > self._delay_s + _SAME_TIME_S:
+            first = self._pending.pop(0)
+            surplus = self._behind_s - self._delay_s
+            if first.duration_s > surplus + _SAME_TIME_S:
+                self._pending.insert(0, part_of(first, surplus, first.duration_s))
+                first = part_of(first, 0.0, surplus)
+            deltas.append(first)
+            self._behind_s -= first.duration_s
+        # The first motion began before the first state, so nothing can be said about it.
+        return LateStep(deltas=tuple(deltas), motion=step.motion if whole else None, at_rest=step.at_rest)
+
+    def _track(self, late: LateStep) -> bool:
+        """Propagate over a window and correct; True if a measurement supports the new state."""
+        state = self._filter
+        image = self._follow(state, late)
+        supported = False
+        if image is not None:
+            H, residual = state.vision_measurement()
+            if state.innovation(H, residual, image)[1] > self._gate:
+                self._count("gated VO updates")
+                state.drop_vision()
+            else:
+                state.correct(H, residual, image)
+                supported = True
+        if late.at_rest:
+            supported = self._stand_still() or supported
+            state.drop_clone()
+        return supported
+
+    def _track_all(self, late: LateStep, search: ScaleSearch) -> bool:
+        """The same for every hypothesis of the scale."""
+        innovations = []
+        for hypothesis in search.hypotheses:
+            state = hypothesis.state
+            image = self._follow(state, late)
+            if image is not None:
+                H, residual = state.vision_measurement()
+                innovations.append((hypothesis, H, residual, image, *state.innovation(H, residual, image)))
+        supported = bool(innovations) and min(chi_square for *_, chi_square in innovations) <= self._gate
+        for hypothesis, H, residual, image, S, chi_square in innovations:
+            if not supported:
+                hypothesis.state.drop_vision()
+                continue
+            # The density of the VO's step in its own unit: the residual is in metres, hence the scale.
+            density = -0.5 * (chi_square + np.linalg.slogdet(S)[1]) + 3.0 * np.log(hypothesis.state.scale)
+            hypothesis.log_weight += float(density)
+            hypothesis.state.correct(H, residual, image)
+        if innovations and not supported:
+            self._count("gated VO updates")
+        search.reduce()
+        self._filter = search.best
+        if late.at_rest:
+            supported = self._stand_still() or supported
+            self._filter.drop_clone()
+            # At rest nothing is learnt about the scale, and one filter is as good as many.
+            self._look_for_scale(self._scale.guess)
+        elif search.found(self._scale.known_sigma, self._scale.known_probability):
+            self._search = None
+            self._was_known = True
+        return supported
+
+    def _follow(self, state: ScaledFilter, late: LateStep) -> Array | None:
+        """Propagate body and vision; covariance (6, 6), metres, of an image's own error where there is a motion."""
+        motion = late.motion
+        drift, image = (None, None) if motion is None else self._drift.split(state.metric(motion.covariance))
+        if image is None:
+            state.drop_vision()
+        elif state.T_world_vision is None:
+            state.anchor_vision(image)
+        if late.at_rest:
+            state.clone_pose()
+        state.leave()
+        for delta in late.deltas:
+            state.propagate(delta)
+            state.walk_scale(self._scale.walk, delta.duration_s)
+        if motion is not None and drift is not None:
+            state.advance_vision(motion.T_prev_cur, drift)
+        return image
+
+    def _look_for_scale(self, guess: float) -> None:
+        self._search = ScaleSearch(self._filter, guess, self._scale.ratio)
+        self._filter = self._search.best
