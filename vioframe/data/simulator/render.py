@@ -77,7 +77,9 @@ class Renderer:
         width, height = camera.size_px
         grid = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), axis=-1)
         ideal = camera_models.normalised(camera, grid)
-        self._blind = np.linalg.norm(ideal, axis=-1) > _WIDEST
+        # Beyond a right angle the inverse of the distortion is meaningless, which the way back shows.
+        again = camera_models.distort(camera, ideal) * camera.intrinsics_px[:2] + camera.intrinsics_px[2:]
+        self._blind = (np.linalg.norm(ideal, axis=-1) > _WIDEST) | (np.abs(again - grid).max(axis=-1) > 0.01)
         ideal[self._blind] = 0.0
         self._x = np.ascontiguousarray(ideal[..., 0], dtype=np.float32)
         self._y = np.ascontiguousarray(ideal[..., 1], dtype=np.float32)

@@ -42,6 +42,11 @@ def _powers(u: Array, derivative: int) -> Array:
     return np.stack(rows)
 
 
+def basis_weights(u: Array) -> Array:
+    """Weights (ORDER, N) of the control points at fractions (N,) of a segment."""
+    return _BLENDING @ _powers(u, 0)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionState:
     """The body at one or many instants, exactly.

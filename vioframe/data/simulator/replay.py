@@ -1,0 +1,379 @@
+"""``dataset=replay``: the motion of a recording, seen again through simulated eyes.
+
+The recording gives ground truth, frame stamps, calibration and, if wanted, its own inertial samples; the
+images are drawn along a smooth motion fitted to the ground truth. This is how long runs with real motion
+and real inertial noise are had where the images themselves are too large to ship.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+
+from vioframe.checks import Array, Stamps
+from vioframe.conventions import NANOSECONDS
+from vioframe.data.recording import Dataset, Finding, Recording
+from vioframe.data.simulator.cameras import CameraSettings
+from vioframe.data.simulator.degrade import Degradations
+from vioframe.data.simulator.families import Place, PlannedMotion
+from vioframe.data.simulator.fit import fit_spline, longest_covered
+from vioframe.data.simulator.imu import BlockCutter, ImuSettings, InertialSensor, exact_imu, join_stamps
+from vioframe.data.simulator.spline import MotionState, SplineMotion
+from vioframe.errors import ConfigError, DataError
+from vioframe.types import Frame, ImuBlock, Packet, SensorRig, Trajectory
+
+if TYPE_CHECKING:
+    from vioframe.data.simulator.imaging import Imager
+
+ImuSource = Literal["recorded", "simulated"]
+PlaceChoice = Literal["auto", "room", "hall", "corridor", "street"]
+
+# Motions that reach further than this are driven, not carried.
+_INDOORS_M = 40.0
+
+
+class ReplayDataset(Dataset):
+    """Sequences of another data set, drawn anew.
+
+    Args:
+        source: the data set; its images are not used.
+        imu: ``recorded``: the source's own samples; ``simulated``: exact samples of the fitted motion with the
+            noise of ``imu_settings``.
+        place: what is built around the motion; ``auto`` by its extent.
+        cameras: cameras to draw, 1 or 2, with the calibration of the source.
+        images: False yields frames without pixels.
+        knot_s: time between control poses of the fitted motion; never shorter than the step of the truth.
+        max_gap_s: a longer hole in the ground truth cannot be bridged; the longest stretch is replayed.
+        start_s: what to leave out at the start of the covered stretch.
+        duration_s: how much to replay; None for all.
+        seed: of the world, of image noise and of simulated inertial noise.
+        noise_dn: sensor noise of the images, grey values.
+        rolling_shutter_s: first to last row.
+        imu_settings: of the simulated sensor; None takes the densities and the rate of the source.
+        degradations: what spoils the images.
+
+    Raises:
+        ConfigError: a value that cannot be.
+    """
+
+    def __init__(
+        self,
+        *,
+        source: Dataset,
+        imu: ImuSource = "recorded",
+        place: PlaceChoice = "auto",
+        cameras: int = 1,
+        images: bool = True,
+        knot_s: float = 0.05,
+        max_gap_s: float = 0.3,
+        start_s: float = 0.0,
+        duration_s: float | None = None,
+        seed: int = 0,
+        noise_dn: float = 1.0,
+        rolling_shutter_s: float = 0.0,
+        imu_settings: ImuSettings | None = None,
+        degradations: Degradations | None = None,
+    ) -> None:
+        if not isinstance(source, Dataset):
+            raise ConfigError(f"dataset.source must be a data set, got {type(source).__name__}")
+        if imu not in get_args(ImuSource):
+            raise ConfigError(f"dataset.imu must be recorded or simulated, got {imu!r}")
+        if place not in get_args(PlaceChoice):
+            raise ConfigError(f"dataset.place must be one of {', '.join(get_args(PlaceChoice))}, got {place!r}")
+        if cameras not in (1, 2):
+            raise ConfigError(f"dataset.cameras must be 1 or 2, got {cameras}")
+        if not knot_s > 0.0 or not max_gap_s > 0.0:
+            raise ConfigError(f"dataset.knot_s and dataset.max_gap_s must be positive, got {knot_s} and {max_gap_s}")
+        if not start_s >= 0.0:
+            raise ConfigError(f"dataset.start_s must not be negative, got {start_s}")
+        if duration_s is not None and not duration_s > 0.0:
+            raise ConfigError(f"dataset.duration_s must be positive, got {duration_s}")
+        if not isinstance(seed, int) or seed < 0:
+            raise ConfigError(f"dataset.seed must be a whole number from 0, got {seed!r}")
+        self._source = source
+        self._imu = imu
+        self._place = place
+        self._cameras = cameras
+        self._camera_settings = CameraSettings(noise_dn=noise_dn, rolling_shutter_s=rolling_shutter_s, images=images)
+        self._knot_s = knot_s
+        self._max_gap_s = max_gap_s
+        self._start_s = start_s
+        self._duration_s = duration_s
+        self._seed = seed
+        self._imu_settings = imu_settings
+        self._degradations = degradations or Degradations()
+
+    @property
+    def sequences(self) -> Sequence[str]:
+        """Those of the source."""
+        return self._source.sequences
+
+    def open(self, sequence: str) -> "ReplayRecording":
+        """Fit the motion of one sequence.
+
+        Raises:
+            DataError: the source has no ground truth or no calibrated camera, or nothing is left to replay.
+        """
+        recording = self._source.open(sequence)
+        truth = recording.ground_truth()
+        if truth is None:
+            raise DataError(f"{sequence}: a replay needs ground truth, and this recording has none")
+        # A recording read without its images streams no camera, but still knows them.
+        cameras = tuple(getattr(recording, "cameras", ())) or recording.rig.cameras
+        if len(cameras) < self._cameras:
+            raise DataError(
+                f"{sequence}: a replay with {self._cameras} camera(s) needs their calibration, and the source has "
+                f"that of {len(cameras)}: set dataset.cameras"
+            )
+        covered = longest_covered(truth, self._max_gap_s)
+        begin_ns = int(covered.stamps_ns[0]) + round(self._start_s * NANOSECONDS)
+        end_ns = int(covered.stamps_ns[-1])
+        if self._duration_s is not None:
+            end_ns = min(end_ns, begin_ns + round(self._duration_s * NANOSECONDS))
+        step_s = float(np.median(np.diff(covered.stamps_ns))) / NANOSECONDS
+        motion = fit_spline(covered, max(self._knot_s, step_s))
+        rig = replace(recording.rig, cameras=cameras[: self._cameras])
+        settings = self._imu_settings
+        if settings is None:
+            noise = rig.imu
+            settings = ImuSettings(
+                rate_hz=noise.rate_hz,
+                gyro_noise=noise.gyro_noise,
+                gyro_walk=noise.gyro_walk,
+                accel_noise=noise.accel_noise,
+                accel_walk=noise.accel_walk,
+            )
+        if self._imu == "simulated":
+            rig = replace(rig, imu=settings.noise)
+        return ReplayRecording(
+            source=recording,
+            rig=rig,
+            plan=PlannedMotion(motion=motion, place=self._choose_place(motion)),
+            origin_ns=int(covered.stamps_ns[0]),
+            begin_ns=begin_ns,
+            end_ns=end_ns,
+            simulated=settings if self._imu == "simulated" else None,
+            camera=self._camera_settings,
+            degradations=self._degradations,
+            seed=self._seed,
+        )
+
+    def _choose_place(self, motion: SplineMotion) -> Place:
+        if self._place != "auto":
+            return self._place
+        extent = np.ptp(motion.positions, axis=0)
+        if extent[:2].max() > _INDOORS_M:
+            return "street"
+        return "hall" if extent[2] > 2.0 or extent[:2].max() > 10.0 else "room"
+
+
+class ReplayRecording(Recording):
+    """One recording drawn anew; made by :class:`ReplayDataset`.
+
+    Attributes:
+        name: of the source's sequence.
+        motion: fitted; its time zero is ``origin_ns``.
+
+    Args:
+        source: where inertial samples and frame stamps come from.
+        rig: calibration of what is yielded.
+        plan: motion and place.
+        origin_ns: stamp of the motion's time zero, IMU clock.
+        begin_ns, end_ns: what is replayed, IMU clock.
+        simulated: inertial sensor, or None for the source's samples.
+        camera: shutter, sensor noise, and whether to draw at all.
+        degradations: what spoils the images.
+        seed: of all that is random.
+    """
+
+    def __init__(
+        self,
+        *,
+        source: Recording,
+        rig: SensorRig,
+        plan: PlannedMotion,
+        origin_ns: int,
+        begin_ns: int,
+        end_ns: int,
+        simulated: ImuSettings | None,
+        camera: CameraSettings,
+        degradations: Degradations,
+        seed: int,
+    ) -> None:
+        self.name = source.name
+        self.motion = plan.motion
+        self._source = source
+        self._rig = rig
+        self._plan = plan
+        self._origin_ns = origin_ns
+        self._span_ns = begin_ns, end_ns
+        self._simulated = simulated
+        self._camera = camera
+        self._degradations = degradations
+        self._seed = seed
+        self._imager: Imager | None = None
+        # With a rolling shutter the last row, too, must lie on the motion.
+        readout_ns = round(camera.rolling_shutter_s * NANOSECONDS)
+        arrivals = [
+            packet.stamp_ns + rig.camera_delay_ns for packet in source.packets() if isinstance(packet, Frame)
+        ]
+        stamps = np.array(arrivals, dtype=np.int64)
+        stamps = stamps[(stamps >= begin_ns) & (stamps <= end_ns - readout_ns)]
+        kept = ~degradations.dropped(len(stamps), seed)
+        self._dropped = int(np.count_nonzero(~kept))
+        self._frames_ns: Stamps = stamps[kept]
+        if len(self._frames_ns) < 2:
+            raise DataError(
+                f"{source.name}: fewer than two frames lie within the replayed part of the ground truth "
+                f"({begin_ns}…{end_ns} ns): check dataset.start_s and dataset.duration_s"
+            )
+
+    @property
+    def rig(self) -> SensorRig:
+        """Calibration of the source, with the cameras that are drawn."""
+        return self._rig
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames, without the dropped ones."""
+        return len(self._frames_ns)
+
+    @property
+    def frame_stamps_ns(self) -> Stamps:
+        """Instants (N,) at which the frames see the world, IMU clock."""
+        return self._frames_ns
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first to the last frame."""
+        return float(self._frames_ns[-1] - self._frames_ns[0]) / NANOSECONDS
+
+    @property
+    def imager(self) -> "Imager":
+        """Draws the frames; made when first asked for."""
+        if self._imager is None:
+            from vioframe.data.simulator.imaging import Imager
+
+            self._imager = Imager(
+                plan=self._plan,
+                cameras=self._rig.cameras,
+                settings=self._camera,
+                degradations=self._degradations,
+                seed=self._seed,
+                world_seed=self._seed,
+                duration_s=self.motion.duration_s,
+            )
+        return self._imager
+
+    def elapsed_s(self, stamps_ns: Stamps) -> Array:
+        """Time (N,) in s on the motion of stamps on the IMU clock."""
+        return (stamps_ns - self._origin_ns) / NANOSECONDS
+
+    def packets(self) -> Iterator[Packet]:
+        """Stream the replayed part: an image arrives with the first sample at or after it."""
+        cutter = BlockCutter(self._blocks())
+        for stamp_ns in self._frames_ns:
+            yield from cutter.until(int(stamp_ns))
+            images = self.imager.images(float(self.elapsed_s(stamp_ns))) if self._camera.images else ()
+            yield Frame(stamp_ns=int(stamp_ns) - self._rig.camera_delay_ns, images=images)
+        yield from cutter.until(None)
+
+    def _blocks(self) -> Iterator[ImuBlock]:
+        begin_ns, end_ns = self._span_ns
+        if self._simulated is not None:
+            yield from (samples.block for samples in self._sensor(self._simulated).stream())
+            return
+        for packet in self._source.packets():
+            if not isinstance(packet, ImuBlock):
+                continue
+            inside = (packet.stamps_ns >= begin_ns) & (packet.stamps_ns <= end_ns)
+            if inside.all():
+                yield packet
+            elif inside.any():
+                yield ImuBlock(
+                    stamps_ns=packet.stamps_ns[inside], gyro=packet.gyro[inside], accel=packet.accel[inside]
+                )
+
+    def _sensor(self, settings: ImuSettings) -> InertialSensor:
+        begin_ns, end_ns = self._span_ns
+        return InertialSensor(
+            settings,
+            motion=_Shifted(self.motion, float(self.elapsed_s(np.int64(begin_ns)))),
+            gravity=self._rig.gravity,
+            start_ns=begin_ns,
+            duration_s=(end_ns - begin_ns) / NANOSECONDS,
+            seed=self._seed,
+        )
+
+    def exact_imu(self, stamps_ns: Stamps) -> ImuBlock:
+        """What a perfect sensor on the fitted motion would read at these stamps."""
+        gyro, accel = exact_imu(self.motion, self.elapsed_s(stamps_ns), self._rig.gravity)
+        return ImuBlock(stamps_ns=stamps_ns, gyro=gyro, accel=accel)
+
+    def ground_truth(self) -> Trajectory:
+        """The fitted motion at 200 Hz and at every frame."""
+        begin_ns, end_ns = self._span_ns
+        grid = np.arange(begin_ns, end_ns + 1, NANOSECONDS // 200, dtype=np.int64)
+        stamps = join_stamps(grid, self._frames_ns, apart_ns=NANOSECONDS // 1000)
+        state = self.motion.evaluate(self.elapsed_s(stamps))
+        return Trajectory(stamps_ns=stamps, T_world_body=state.T_world_body, v_world_body=state.velocity)
+
+    def findings(self) -> list[Finding]:
+        """Those of the source, and how well the fitted motion agrees with its inertial samples."""
+        found = list(self._source.findings())
+        begin_ns, end_ns = self._span_ns
+        text = (
+            f"{(end_ns - begin_ns) / NANOSECONDS:.1f} s of ground truth drawn anew in a {self._plan.place}, "
+            f"{self.frame_count} frames"
+        )
+        found.append(Finding(level="note", subject="replay", text=text))
+        correlation = self.agreement()
+        level: Literal["good", "bad"] = "good" if min(correlation) > 0.9 else "bad"
+        text = "gyro and fitted motion correlate by " + ", ".join(f"{c:.4f}" for c in correlation)
+        if level == "bad":
+            text += "; check clocks and axes of the recording"
+        found.append(Finding(level=level, subject="replayed rotation", text=text))
+        return found
+
+    def agreement(self, window_s: float = 0.1) -> tuple[float, float, float]:
+        """Correlation, by axis, of the recorded gyro with the rate of the fitted motion, as means over ``window_s``.
+
+        Averaging leaves out vibration, which no ground truth follows.
+        """
+        begin_ns, end_ns = self._span_ns
+        blocks = [packet for packet in self._source.packets() if isinstance(packet, ImuBlock)]
+        stamps = np.concatenate([block.stamps_ns for block in blocks])
+        gyro = np.concatenate([block.gyro for block in blocks])
+        inside = (stamps >= begin_ns) & (stamps <= end_ns)
+        stamps, gyro = stamps[inside], gyro[inside]
+        rate = self.exact_imu(stamps).gyro
+        cell = ((stamps - begin_ns) // round(window_s * NANOSECONDS)).astype(np.int64)
+        _, cell = np.unique(cell, return_inverse=True)
+        count = np.bincount(cell)
+        both = [
+            [np.bincount(cell, values[:, axis]) / count for values in (gyro, rate)] for axis in range(3)
+        ]
+        first, second, third = (float(np.corrcoef(a, b)[0, 1]) for a, b in both)
+        return first, second, third
+
+    def counters(self) -> Mapping[str, int]:
+        """Dropped frames."""
+        return {"dropped frames": self._dropped} if self._dropped else {}
+
+
+class _Shifted:
+    """A motion whose time zero is later."""
+
+    def __init__(self, motion: SplineMotion, offset_s: float) -> None:
+        self._motion = motion
+        self._offset_s = offset_s
+
+    @property
+    def duration_s(self) -> float:
+        """What is left, s."""
+        return self._motion.duration_s - self._offset_s
+
+    def evaluate(self, t_s: Array | float) -> MotionState:
+        """State at times (...) in s after the new zero."""
+        return self._motion.evaluate(np.asarray(t_s) + self._offset_s)
