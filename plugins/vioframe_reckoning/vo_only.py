@@ -85,8 +85,11 @@ class VoOnlyFuser(Fuser):
         self._stamp_ns: int | None = None
         self._T_world_body: Array = np.eye(4)
         self._velocity: Array = np.zeros(3)
-        # Tangent of the last valid motion of the body, a second of it.
-        self._twist: Array = np.zeros(6)
+        # The last valid motion of the body and how long it took, s: coasting goes on with it.
+        self._last_motion: Array = np.eye(4)
+        self._last_duration = 1.0
+        # Age of that motion: it is the mean over its window, so half of it old when the window ends.
+        self._age_s = 0.0
         # (6, 6) of (rotation, translation), right perturbation of T_world_body; None once a motion states none.
         self._covariance: Array | None = None
         self._velocity_covariance: Array = np.zeros((3, 3))
@@ -136,7 +139,7 @@ class VoOnlyFuser(Fuser):
             if covariance is None:
                 covariance = initial_covariance(given.T_world_body[:3, :3])
             # Coasting before the first valid motion goes on as the given state moves.
-            self._twist = np.concatenate([np.zeros(3), given.T_world_body[:3, :3].T @ given.v_world_body])
+            self._last_motion = se3.from_parts(np.eye(3), given.T_world_body[:3, :3].T @ given.v_world_body)
         else:
             R_world_body = level(measurement.window.imu.accel.mean(axis=0)) if self._level else np.eye(3)
             self._T_world_body = se3.from_parts(R_world_body, np.zeros(3))
@@ -153,17 +156,22 @@ class VoOnlyFuser(Fuser):
             into_metres = np.repeat([1.0, self._scale], 3)
             into_body = se3.adjoint(rig.cameras[0].T_body_cam) * into_metres
             covariance = into_body @ covariance @ into_body.T
-        self._twist = se3.log(motion) / duration
+        self._last_motion, self._last_duration = motion, duration
+        self._age_s = 0.5 * duration
         self._append(motion, covariance, duration)
 
     def _coast(self, duration: float) -> None:
-        twist = np.zeros(6) if self._hold else self._twist
+        tangent = se3.log(self._last_motion) * (duration / self._last_duration)
+        # A constant unknown rate and acceleration since that motion: windows in a row add up to their square of time.
         rate, accel = self._coast_sigmas
-        sigmas = np.repeat([rate * duration, 0.5 * accel * duration**2], 3)
+        start, end = self._age_s, self._age_s + duration
+        self._age_s = end
+        sigmas = np.repeat([rate * np.sqrt(end**2 - start**2), 0.5 * accel * np.sqrt(end**4 - start**4)], 3)
         if self._hold:
-            # Staying is off by the whole motion that went before, and more.
-            sigmas = sigmas + np.abs(self._twist).reshape(2, 3).max(axis=1).repeat(3) * duration
-        self._append(se3.exp(twist * duration), np.diag(sigmas**2), duration)
+            # Staying is off by the motion that went before, and more.
+            sigmas += np.abs(tangent).reshape(2, 3).max(axis=1).repeat(3)
+            tangent = np.zeros(6)
+        self._append(se3.exp(tangent), np.diag(sigmas**2), duration)
 
     def _append(self, motion: Array, covariance: Array | None, duration: float) -> None:
         before = self._T_world_body
