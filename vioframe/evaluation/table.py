@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from vioframe.evaluation.rows import Row
 from vioframe.evaluation.wording import (
     UNDEFINED,
-    Line,
     accuracy_lines,
     counter_text,
     has_run,
@@ -25,6 +24,8 @@ if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
 
+# Spaces and rule between two columns.
+_GUTTER = 3
 _WIDE_KEYS = (
     "path_m",
     "ate_m",
@@ -48,7 +49,7 @@ def print_rows(rows: Sequence[Row], folder: Path, *, hint: str = "") -> None:
     from rich.console import Console
 
     console = Console()
-    for part in render_rows(rows):
+    for part in render_rows(rows, console.width):
         console.print(part)
     console.print(f"results in {folder}", style="bold", soft_wrap=True, highlight=False, markup=False)
     report = folder / "report.html"
@@ -58,15 +59,13 @@ def print_rows(rows: Sequence[Row], folder: Path, *, hint: str = "") -> None:
         console.print(hint, soft_wrap=True, highlight=False, markup=False)
 
 
-def render_rows(rows: Sequence[Row]) -> "list[RenderableType]":
-    """What :func:`print_rows` prints: one long table for one sequence, two with a row each for several."""
+def render_rows(rows: Sequence[Row], width: int = 120) -> "list[RenderableType]":
+    """What :func:`print_rows` prints: one long table for one sequence, a row each for several."""
     parts: list[RenderableType] = []
     if len(rows) == 1:
-        parts += [_single(rows[0])]
+        parts += [_single(rows[0])] if has_run(rows[0]) else []
     elif rows:
-        parts += [_many_accuracy(rows)]
-        if running_lines(max(rows, key=len)):
-            parts += [_many_running(rows)]
+        parts += _many(rows, width)
     for row in rows:
         parts += _notes(row, name=len(rows) > 1)
     return parts + _protocols(rows)
@@ -76,7 +75,7 @@ def _new_table(title: str) -> "Table":
     from rich import box
     from rich.table import Table
 
-    return Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    return Table(title=title or None, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
 
 
 def _cell(text: str) -> "Text":
@@ -113,35 +112,57 @@ def _single(row: Row) -> "Table":
     return table
 
 
-def _many_accuracy(rows: Sequence[Row]) -> "Table":
-    lines = [line for line in accuracy_lines(max(rows, key=len)) if line.key in _WIDE_KEYS]
-    table = _with_columns("Accuracy", lines)
+def _many(rows: Sequence[Row], width: int) -> "list[RenderableType]":
+    """A row for each sequence; the columns in as many tables as the width asks for."""
+    outputs: list[tuple[str, Row, Mapping[str, object]]] = []
     for row in rows:
-        table.add_row(_cell(str(row["sequence"])), *(_cell(show(row, line, unit=False)) for line in lines))
+        outputs.append((str(row["sequence"]), row, row))
         final = row.get("final")
         if isinstance(final, Mapping):
-            table.add_row("  final", *(_cell(show(final, line, unit=False)) for line in lines))
-    return table
+            outputs.append(("  final", row, final))
+    names = [name for name, _, _ in outputs]
+    widest_name = max(len("sequence"), *map(len, names))
+    tables: list[RenderableType] = []
+    chunk: list[list[str]] = []
+    empty = width - widest_name - _GUTTER
+    room = empty
+    for column in _columns(rows, outputs):
+        needed = _GUTTER + max(len(text) for cell in column for text in cell.split("\n"))
+        if chunk and needed > room:
+            tables.append(_table_of(names, chunk))
+            chunk, room = [], empty
+        chunk.append(column)
+        room -= needed
+    return [*tables, _table_of(names, chunk)]
 
 
-def _many_running(rows: Sequence[Row]) -> "Table":
-    lines = running_lines(max(rows, key=len))
-    table = _with_columns("Running and consistency", lines)
-    table.add_column("ms per\nframe", justify="right")
-    table.add_column("status")
-    for row in rows:
-        parts = row.get("ms_per_frame")
-        total = significant(float(parts["total"])) if isinstance(parts, Mapping) else UNDEFINED
-        cells = [_cell(show(row, line, unit=False)) for line in lines]
-        table.add_row(_cell(str(row["sequence"])), *cells, _cell(total), str(row["status"]))
-    return table
+def _columns(rows: Sequence[Row], outputs: Sequence[tuple[str, Row, Mapping[str, object]]]) -> list[list[str]]:
+    """Heading and cells of every column; what a final trajectory cannot have stays empty."""
+    fullest = max(rows, key=len)
+    columns = [["\nstatus", *(str(row["status"]) if output is row else "" for _, row, output in outputs)]]
+    accuracy = [line for line in accuracy_lines(fullest) if line.key in _WIDE_KEYS]
+    # How much of the recording the other numbers speak of comes first.
+    running = sorted(running_lines(fullest), key=lambda line: line.key != "completion")
+    for line in (*running[:1], *accuracy, *running[1:]):
+        cells = [show(output, line, unit=False) if line.key in output else "" for _, _, output in outputs]
+        columns.append([f"{line.short}\n{line.unit}", *cells])
+    if "ms_per_frame" in fullest:
+        columns.append(["time\nms/frame", *(_total_ms(row) if output is row else "" for _, row, output in outputs)])
+    return columns
 
 
-def _with_columns(title: str, lines: Sequence[Line]) -> "Table":
-    table = _new_table(title)
-    table.add_column("sequence", overflow="fold")
-    for line in lines:
-        table.add_column(f"{line.short}\n{line.unit}", justify="right")
+def _total_ms(row: Row) -> str:
+    parts = row.get("ms_per_frame")
+    return significant(float(parts["total"])) if isinstance(parts, Mapping) else UNDEFINED
+
+
+def _table_of(names: Sequence[str], columns: Sequence[Sequence[str]]) -> "Table":
+    table = _new_table("")
+    table.add_column("\nsequence", no_wrap=True)
+    for column in columns:
+        table.add_column(column[0], justify="right", no_wrap=True)
+    for index, name in enumerate(names, start=1):
+        table.add_row(name, *(_cell(column[index]) for column in columns))
     return table
 
 

@@ -112,7 +112,8 @@ def evaluate_to_folder(
     Arguments are those of :func:`evaluate_files`; ``config_yaml`` is shown in the report.
 
     Raises:
-        DataError: the ground truth cannot be used; an estimate that cannot is a failed row instead.
+        DataError, MetricError: the ground truth or the only estimate cannot be used; one of several is a
+            failed row instead.
         ConfigError: an unknown alignment.
     """
     _check_alignment(alignment)
@@ -128,6 +129,8 @@ def evaluate_to_folder(
             matched[name] = match(trajectory, truth, options, offset_s=offset_s)
             kinds.setdefault(trajectory.causal, name)
         except VioframeError as error:
+            if len(estimates) == 1:
+                raise
             log.error("%s", error)
             rows.append({"sequence": name, "status": "failed", "error": str(error), "windows": 0})
     if len(kinds) > 1:
