@@ -6,7 +6,7 @@ rests, so a rest is one to rounding.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -49,12 +49,10 @@ class PlannedMotion:
     Attributes:
         motion: of the body.
         place: kind of world.
-        street_grid: corners of the streets, (K, 2) m, in the order driven; empty elsewhere.
     """
 
     motion: SplineMotion
     place: Place
-    street_grid: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 def rotation_from_angles(yaw: Array, pitch: Array, roll: Array) -> Array:
@@ -241,6 +239,14 @@ def _corridor(rng: np.random.Generator, duration_s: float, standstill_s: float) 
     return PlannedMotion(motion=SplineMotion(knot_s=_KNOT_S, positions=position, rotations=rotation), place="corridor")
 
 
+def _car(rng: np.random.Generator, duration_s: float, standstill_s: float) -> PlannedMotion:
+    """A car in town."""
+    # Imported here because driving is made of this module's pieces.
+    from vioframe.data.simulator.drive import plan_drive
+
+    return plan_drive(rng, duration_s, standstill_s)
+
+
 Builder = Callable[[np.random.Generator, float, float], PlannedMotion]
 
 FAMILIES: dict[str, tuple[FamilyTraits, Builder]] = {
@@ -249,6 +255,7 @@ FAMILIES: dict[str, tuple[FamilyTraits, Builder]] = {
     "rotation": (FamilyTraits(place="room"), _rotation),
     "drone": (FamilyTraits(place="hall"), _drone),
     "corridor": (FamilyTraits(place="corridor", duration_s=70.0), _corridor),
+    "car": (FamilyTraits(place="street", kit="kitti", duration_s=110.0), _car),
 }
 """Name → traits and builder (generator, duration_s, standstill_s)."""
 

@@ -7,9 +7,11 @@ import numpy as np
 from vioframe.checks import Array
 from vioframe.data.simulator.cameras import CameraSettings
 from vioframe.data.simulator.degrade import Degradations
+from vioframe.data.simulator.drive import BODY_HEIGHT_M
 from vioframe.data.simulator.families import PlannedMotion
 from vioframe.data.simulator.render import Renderer, View
 from vioframe.data.simulator.rooms import build_room
+from vioframe.data.simulator.street import build_street
 from vioframe.data.simulator.texture import Atlas
 from vioframe.data.simulator.world import World, WorldPlan
 from vioframe.geometry import camera as camera_models
@@ -26,6 +28,14 @@ def build_world(plan: PlannedMotion, seed: int, duration_s: float, degradations:
     rng = np.random.default_rng([seed, 20])
     times = np.arange(0.0, duration_s + 0.1, 0.1)
     path = plan.motion.evaluate(times).T_world_body[:, :3, 3]
+    if plan.place == "street":
+        return build_street(
+            rng,
+            path,
+            camera_height_m=BODY_HEIGHT_M,
+            contrast=1.0 - degradations.low_texture,
+            moving=int(degradations.moving_objects),
+        )
     return build_room(
         rng,
         path,

@@ -22,6 +22,8 @@ _WIDEST = np.tan(np.deg2rad(84.0))
 _NEAR_M = 0.02
 _BAND_ROWS = 48
 # Four samples of a pixel, no two in one row or column.
+# OpenCV looks up at most 32767 pixels in a row.
+_SMOOTH_CHUNK = 16_384
 _SUBSAMPLES = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 # Below 1 the copy chosen is finer than the footprint: sharper, at the price of a little aliasing.
 _SHARPNESS = 0.7
@@ -166,9 +168,11 @@ class Renderer:
         for begin in range(0, self._shape[0], _BAND_ROWS):
             rows = slice(begin, begin + _BAND_ROWS)
             self._cast_shell(tables, directions[:, rows], inverse[:, rows], shift, rows, depth[rows], face[rows])
-        for number, top, bottom, left, right in self._candidates(T_world_cam):
+        for number, top, bottom, left, right, closest in self._candidates(T_world_cam):
             window = (slice(top, bottom), slice(left, right))
             near = depth[window]
+            if closest > near.max():
+                continue
             a, u, v = self._world.face_axes(number)
             plane = tables.plane[number]
             if shift is None:
@@ -212,8 +216,8 @@ class Renderer:
             np.copyto(depth, leave, where=nearer)
             np.copyto(face, 2 * axis + forward, where=nearer)
 
-    def _candidates(self, T_world_cam: Array) -> list[tuple[int, int, int, int, int]]:
-        """Faces of boxes that may be seen, nearest first, with the rows and columns they lie within."""
+    def _candidates(self, T_world_cam: Array) -> list[tuple[int, int, int, int, int, float]]:
+        """Faces of boxes that may be seen, nearest first, with the rows and columns they lie within and least depth."""
         poses = T_world_cam[[0, len(T_world_cam) // 2, -1]] if T_world_cam.ndim == 3 else T_world_cam[None]
         numbers, corners = self._world.facing_corners(poses[len(poses) // 2][:3, 3])
         if len(numbers) == 0:
@@ -224,7 +228,7 @@ class Renderer:
             bounds.append(_bounds_at_depth_one(local))
         x0, y0 = (np.min([b[i] for b in bounds], axis=0) for i in (0, 1))
         x1, y1 = (np.max([b[i] for b in bounds], axis=0) for i in (2, 3))
-        nearest = bounds[len(bounds) // 2][4]
+        nearest = np.min([b[4] for b in bounds], axis=0)
         margin = 1 if len(poses) == 1 else 3
         height, width = self._shape
         left = np.maximum(np.searchsorted(self._column_high, x0) - margin, 0)
@@ -233,7 +237,10 @@ class Renderer:
         bottom = np.minimum(np.searchsorted(self._row_low, y1, side="right") + margin, height)
         shown = (right - left > 2 * margin) & (bottom - top > 2 * margin)
         order = np.flatnonzero(shown)[np.argsort(nearest[shown], kind="stable")]
-        return [(int(numbers[i]), int(top[i]), int(bottom[i]), int(left[i]), int(right[i])) for i in order]
+        return [
+            (int(numbers[i]), int(top[i]), int(bottom[i]), int(left[i]), int(right[i]), float(nearest[i]))
+            for i in order
+        ]
 
     def _shade_all(
         self,
@@ -302,7 +309,6 @@ class Renderer:
         shift: np.ndarray | None,
     ) -> None:
         """Replace the pixels where two surfaces meet by the mean of four rays; each ray sees one of the two."""
-        height, width = self._shape
         other = face.copy()
         for own, far in (
             (np.s_[:, 1:], np.s_[:, :-1]),
@@ -312,11 +318,24 @@ class Renderer:
         ):
             np.copyto(other[own], face[far], where=face[own] != face[far])
         pixels = np.flatnonzero(other.ravel() != face.ravel())
-        if len(pixels) == 0:
-            return
+        for begin in range(0, len(pixels), _SMOOTH_CHUNK):
+            part = pixels[begin : begin + _SMOOTH_CHUNK]
+            grey.ravel()[part] = self._mean_of_rays(tables, T_world_cam, depth, face, other, part, shift)
+
+    def _mean_of_rays(
+        self,
+        tables: _Tables,
+        T_world_cam: Array,
+        depth: np.ndarray,
+        face: np.ndarray,
+        other: np.ndarray,
+        pixels: np.ndarray,
+        shift: np.ndarray | None,
+    ) -> np.ndarray:
+        """Brightness (N,) of pixels, given by flat index, each of which holds two surfaces."""
         pair = np.stack([face.ravel()[pixels], other.ravel()[pixels]])
         total = np.zeros(len(pixels), np.float32)
-        rows = pixels // width
+        rows = pixels // self._shape[1]
         length = self._length.ravel()[pixels]
         moved = None if shift is None else shift[:, rows, 0]
         for along_x, along_y in _SUBSAMPLES:
@@ -347,7 +366,8 @@ class Renderer:
                 None if moved is None else moved[:, None],
             )
             total += shaded[0]
-        grey.ravel()[pixels] = total / np.float32(len(_SUBSAMPLES))
+        mean: np.ndarray = total / np.float32(len(_SUBSAMPLES))
+        return mean
 
     def _try_faces(
         self,
