@@ -12,6 +12,9 @@ from vioframe.types import Camera
 # Newton on the radius converges quadratically; twenty fixed-point steps are what OpenCV takes.
 _UNDISTORT_STEPS = 20
 
+# A fisheye lens sees past 90°, where a point at depth 1 does not exist; the tangent stops just before.
+_WIDEST_NORMALISED = np.radians(89.9)
+
 
 def intrinsic_matrix(camera: Camera) -> Array:
     """K (3, 3)."""
@@ -45,7 +48,10 @@ def distort(camera: Camera, points: Array) -> Array:
 
 
 def undistort(camera: Camera, points: Array) -> Array:
-    """Ideal normalised coordinates (..., 2) of distorted ones (..., 2); inverse of :func:`distort`."""
+    """Ideal normalised coordinates (..., 2) of distorted ones (..., 2); inverse of :func:`distort`.
+
+    Rays that a fisheye lens sees 89.9° or more off its axis come back at 89.9°: use :func:`bearings` there.
+    """
     if camera.model == "radtan":
         k1, k2, p1, p2, k3 = np.pad(camera.distortion, (0, 5 - len(camera.distortion)))
         x, y = points[..., 0].copy(), points[..., 1].copy()
@@ -58,17 +64,23 @@ def undistort(camera: Camera, points: Array) -> Array:
             )
         return np.stack([x, y], axis=-1)
     if camera.model == "equidistant":
-        k1, k2, k3, k4 = camera.distortion
         bent = np.linalg.norm(points, axis=-1)
-        angle = np.minimum(bent, 0.5 * np.pi)
-        for _ in range(_UNDISTORT_STEPS):
-            a2 = angle * angle
-            value = angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4)))) - bent
-            slope = 1 + a2 * (3 * k1 + a2 * (5 * k2 + a2 * (7 * k3 + 9 * a2 * k4)))
-            angle = angle - value / slope
+        angle = np.minimum(_angle_off_axis(camera, bent), _WIDEST_NORMALISED)
         factor = np.where(bent < 1e-8, 1.0, np.tan(angle) / np.where(bent < 1e-8, 1.0, bent))
         return points * factor[..., None]
     return points
+
+
+def _angle_off_axis(camera: Camera, bent: Array) -> Array:
+    """Angle (...) in rad from the optical axis at distorted radii (...), of an equidistant camera."""
+    k1, k2, k3, k4 = camera.distortion
+    angle = np.minimum(bent, 0.5 * np.pi)
+    for _ in range(_UNDISTORT_STEPS):
+        a2 = angle * angle
+        value = angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4)))) - bent
+        slope = 1 + a2 * (3 * k1 + a2 * (5 * k2 + a2 * (7 * k3 + 9 * a2 * k4)))
+        angle = angle - value / slope
+    return angle
 
 
 def project(camera: Camera, points_cam: Array) -> tuple[Array, Mask]:
@@ -102,7 +114,13 @@ def normalised(camera: Camera, pixels: Array) -> Array:
 
 
 def bearings(camera: Camera, pixels: Array) -> Array:
-    """Unit vectors (..., 3) in the camera frame through pixels (..., 2)."""
+    """Unit vectors (..., 3) in the camera frame through pixels (..., 2); behind the image plane past 90°."""
+    if camera.model == "equidistant":
+        points = (pixels - camera.intrinsics_px[2:]) / camera.intrinsics_px[:2]
+        bent = np.linalg.norm(points, axis=-1)
+        angle = _angle_off_axis(camera, bent)
+        factor = np.where(bent < 1e-8, 1.0, np.sin(angle) / np.where(bent < 1e-8, 1.0, bent))
+        return np.concatenate([points * factor[..., None], np.cos(angle)[..., None]], axis=-1)
     ideal = normalised(camera, pixels)
     rays = np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1)
     unit: Array = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
