@@ -165,15 +165,18 @@ def _read_job(path: Path) -> JobResult:
 
 
 def _read_status(folder: Path, document: dict[str, object] | None) -> tuple[str, str]:
-    """Return a job's status and error; one without ``metrics.json`` has not finished, whatever it says."""
+    """Return a job's status and error; one that left neither word nor ``metrics.json`` has not finished."""
     word = _read_json(folder / STATUS_FILE) or {}
     status, error = str(word.get("status") or ""), str(word.get("error") or "")
     if status in ("failed", "killed"):
         return status, error or "no reason given"
     if document is None:
-        if status == "finished" or (folder / METRICS_FILE).exists():
-            return "failed", f"it left no readable {METRICS_FILE}"
-        return "unfinished", f"it ended without a word and left no {METRICS_FILE} (interrupted, killed, or out of memory)"
+        if (folder / METRICS_FILE).exists():
+            return "failed", f"its {METRICS_FILE} cannot be read"
+        if status == "finished":
+            # A task that measures nothing, such as one that checks a recording.
+            return status, ""
+        return "unfinished", f"it ended without a word and left no {METRICS_FILE} (interrupted, killed, out of memory?)"
     sequences = document.get("sequences")
     for row in sequences if isinstance(sequences, list) else []:
         if isinstance(row, dict) and row.get("status", "finished") != "finished":

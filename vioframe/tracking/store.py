@@ -19,6 +19,8 @@ SERVER_SCHEMES = ("http", "https")
 DATABASE_PORTS = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}
 ARTIFACT_FOLDER = "mlartifacts"
 LOCK_TIMEOUT_S = 120.0
+# Makes MLflow's pages open on runs and charts, not on chat traces.
+_KIND = {"mlflow.experimentKind": "custom_model_development"}
 
 
 def import_mlflow(timeout_s: float = 5.0) -> Any:
@@ -201,7 +203,7 @@ def _find_experiment(uri: str, experiment: str, folder: Path | None) -> str:
                 folder = Path.cwd()
             location = None if folder is None else (folder / ARTIFACT_FOLDER).as_uri()
             try:
-                return str(client.create_experiment(experiment, artifact_location=location))
+                return str(client.create_experiment(experiment, artifact_location=location, tags=_KIND))
             except client_errors():
                 # Another process may have created it in between; if not, the first error tells why.
                 found = client.get_experiment_by_name(experiment)
