@@ -1,8 +1,8 @@
 """Multirun: one parent record above the jobs' records, and one summary of what became of each job.
 
 A job leaves three files in its folder: ``job.json`` (written here when it starts: number and overrides),
-``metrics.json`` and ``status.json`` (``{"status": "finished"|"failed"|"killed", "error": sentence}``, by the
-task). They are all that the summary reads, so that it is the same for jobs of this process, of other
+``metrics.json`` and ``status.json`` (``{"status": "finished"|"failed"|"interrupted", "error": sentence}``, by
+the task). They are all that the summary reads, so that it is the same for jobs of this process, of other
 processes and of a cluster, and for jobs that died without a word.
 """
 
@@ -136,7 +136,7 @@ def write_status(folder: Path, status: str, error: str = "") -> None:
 
     Args:
         folder: of the job.
-        status: ``finished``, ``failed`` or ``killed``.
+        status: ``finished``, ``failed`` or ``interrupted``.
         error: one sentence.
     """
     folder.mkdir(parents=True, exist_ok=True)

@@ -57,7 +57,8 @@ class JobResult:
     Attributes:
         number: its place in the sweep; -1 where unknown.
         overrides: all of the command line's choices for it, ``key=value``.
-        status: ``finished``, ``failed``, ``killed``, ``unfinished`` (it died without a word) or ``not started``.
+        status: ``finished``; ``failed``, ``interrupted`` or what else its task wrote; ``unfinished`` (it died without a
+            word); ``not started``.
         error: one sentence, for all but ``finished``.
         metrics: what ``metrics_of`` finds in its ``metrics.json``; a failed job may have some.
         folder: where its files are; ``None`` if it never started.
@@ -168,7 +169,7 @@ def _read_status(folder: Path, document: dict[str, object] | None) -> tuple[str,
     """Return a job's status and error; one that left neither word nor ``metrics.json`` has not finished."""
     word = _read_json(folder / STATUS_FILE) or {}
     status, error = str(word.get("status") or ""), str(word.get("error") or "")
-    if status in ("failed", "killed"):
+    if status and status != "finished":
         return status, error or "no reason given"
     if document is None:
         if (folder / METRICS_FILE).exists():

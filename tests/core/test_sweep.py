@@ -73,7 +73,7 @@ def printed(jobs: list[JobResult]) -> str:
         (document(0.5), ("failed", "the disk is full"), "failed", "the disk is full"),
         (None, ("failed", "no such folder"), "failed", "no such folder"),
         (None, ("failed", ""), "failed", "no reason given"),
-        (None, ("killed", "interrupted"), "killed", "interrupted"),
+        (document(0.5), ("interrupted", "after 3 of 9"), "interrupted", "after 3 of 9"),
         (None, ("finished", ""), "finished", ""),
         (None, None, "unfinished", "ended without a word"),
         ('{"sequences": [', None, "failed", "cannot be read"),
