@@ -238,13 +238,13 @@ def read_imu_mat(path: Path, times_ns: Stamps) -> ImuBlock:
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
 
+    if not path.is_file():
+        raise DataError(
+            f"{path}: no such file; it should hold the inertial samples of this sequence, ten an image interval: fetch "
+            "it, or take another sequence"
+        )
     try:
         content = loadmat(path)
-    except FileNotFoundError:
-        raise DataError(
-            f"{path}: no such file; it should hold the inertial samples of this sequence, interpolated to ten an image "
-            "interval"
-        ) from None
     except (MatReadError, ValueError, NotImplementedError, OSError, TypeError, EOFError) as error:
         raise DataError(f"{path}: cannot be read as a MATLAB 5 file ({error}): fetch it again") from None
     names = [name for name in content if not name.startswith("__")]

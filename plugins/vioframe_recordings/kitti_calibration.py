@@ -12,7 +12,7 @@ import numpy as np
 from vioframe.checks import Array, Stamps
 from vioframe.conventions import seconds
 from vioframe.errors import DataError
-from vioframe.geometry import se3
+from vioframe.geometry import se3, so3
 from vioframe.types import Camera
 
 
@@ -33,7 +33,8 @@ class DriveDate:
 
 def _from_rotation_and_lever(R_cam_body: list[list[float]], p_body_cam: list[float]) -> Array:
     """T_body_cam0 of ``p_cam = C (p_imu − rho)``: C is R_cam_body, rho the camera's place in the vehicle."""
-    return se3.from_parts(np.array(R_cam_body).T, np.array(p_body_cam))
+    # The printed factors have seven digits, so that their product is off a rotation by 2e-7.
+    return se3.from_parts(so3.normalise(np.array(R_cam_body)).T, np.array(p_body_cam))
 
 
 # calib_cam_to_cam, calib_velo_to_cam and calib_imu_to_velo of each date, multiplied out with R_rect_00.

@@ -347,8 +347,8 @@ def read_oxts(folder: Path, disorder: Disorder) -> Packets:
     truth = Trajectory(
         stamps_ns=stamps_ns,
         T_world_body=poses_of_oxts(values),
-        # Columns: north, east, up.
-        v_world_body=np.stack([values[:, 8], values[:, 7], values[:, 10]], axis=1),
+        # Columns 7, 8 and 11 are the velocities to the north, to the east and upwards.
+        v_world_body=np.stack([values[:, 7], values[:, 6], values[:, 10]], axis=1),
     )
     imu = ImuBlock(stamps_ns=stamps_ns, gyro=values[:, 17:20].copy(), accel=values[:, 11:14].copy())
     return Packets(imu=imu, truth=truth, where=str(folder), findings=tuple(findings))

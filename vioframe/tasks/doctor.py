@@ -85,7 +85,7 @@ def _read_through(recording: Recording, reading_s: float) -> list[Finding]:
         text = f"{backwards} packets come out of order: sort the recording"
         findings.append(Finding(level="bad", subject="order of packets", text=text))
     findings += [
-        Finding(level="bad", subject=subject, text=f"{count} while reading; fetch them again, results miss these frames")
+        Finding(level="bad", subject=subject, text=f"{count}; results miss these frames, fetch them again")
         for subject, count in recording.counters().items()
         if count
     ]
