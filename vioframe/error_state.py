@@ -356,8 +356,11 @@ class InertialFilter:
 
     def propagate(self, delta: InertialDelta) -> None:
         """Move body and covariance over a window."""
-        delta = delta.at(self.body.bias)
         before = self.body
+        if not (
+            np.array_equal(delta.bias.gyro, before.bias.gyro) and np.array_equal(delta.bias.accel, before.bias.accel)
+        ):
+            delta = delta.at(before.bias)
         self.body = propagate(before, delta, self.gravity)
         phi, noise_map = transition(before, self.body, delta, self.gravity)
         covariance = self.covariance.copy()
