@@ -1,9 +1,8 @@
 """One bag on disk, whatever its format: topics, and messages in the order in which they were recorded."""
 
-import sqlite3
 import struct
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -126,10 +125,7 @@ class Bag:
         try:
             yield reader
         finally:
-            # A stream that is given up half-way is closed by another thread than the one that read it; SQLite
-            # refuses that, and closes the file itself when the object goes.
-            with suppress(sqlite3.ProgrammingError):
-                reader.close()
+            reader.close()
 
 
 def _decoder(path: Path, reader: Any, connection: Any, data: bytes, stamp_ns: int) -> Callable[[], Any]:

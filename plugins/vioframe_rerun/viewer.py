@@ -20,7 +20,8 @@ TIMELINE = "stamp"
 
 _TRUTH_POINTS = 5_000
 _MAX_TRUTH_GAP_NS = 200_000_000
-_ESTIMATE_COLOR, _TRUTH_COLOR = (31, 119, 180), (150, 150, 150)
+_TRUTH_COLOR = (150, 150, 150)
+_STATUS_COLORS = {"starting": (255, 187, 51), "tracking": (31, 119, 180), "lost": (214, 39, 40)}
 _AXIS_COLORS = ((214, 39, 40), (44, 160, 44), (31, 119, 180))
 
 
@@ -66,7 +67,6 @@ class RerunViewer(Viewer):
         self._truth_placed = False
         self._windows = 0
         self._last_position: Array | None = None
-        self._last_status = ""
 
     @property
     def hint(self) -> str:
@@ -101,7 +101,6 @@ class RerunViewer(Viewer):
         self._truth_placed = False
         self._windows = 0
         self._last_position = None
-        self._last_status = ""
         stream.send_recording_name(sequence)
         stream.send_blueprint(_blueprint(bool(rig.cameras) and rig.has_images and self._every > 0))
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -196,14 +195,11 @@ class RerunViewer(Viewer):
         self._stream.log("world/body", rr.Transform3D(translation=position, mat3x3=T[:3, :3]))
         # One piece of the line for each state: the view shows all that lie before its cursor.
         start = position if self._last_position is None else self._last_position
-        self._stream.log("world/estimate", rr.LineStrips3D([[start, position]], colors=[_ESTIMATE_COLOR]))
+        self._stream.log("world/estimate", rr.LineStrips3D([[start, position]], colors=[_STATUS_COLORS[state.status]]))
         self._last_position = position.copy()
         self._stream.log("plots/speed", rr.Scalars(float(np.linalg.norm(state.v_world_body))))
         self._stream.log("plots/bias_gyro", rr.Scalars(state.bias.gyro))
         self._stream.log("plots/bias_accel", rr.Scalars(state.bias.accel))
-        if state.status != self._last_status:
-            self._stream.log("status", rr.TextLog(state.status))
-            self._last_status = state.status
         if not self._truth_placed and state.status == "tracking":
             self._place_truth(state)
 
@@ -237,9 +233,12 @@ def truth_to_estimate(truth: Trajectory, state: NavState) -> Array | None:
 
 
 def thin(points: Array, stamps_ns: Stamps) -> Array:
-    """At most :data:`_TRUTH_POINTS` of the points (N, 3), the last one among them."""
-    wanted = np.linspace(stamps_ns[0], stamps_ns[-1], min(len(points), _TRUTH_POINTS)).astype(np.int64)
-    kept: Array = points[np.unique(np.minimum(np.searchsorted(stamps_ns, wanted), len(points) - 1))]
+    """At most :data:`_TRUTH_POINTS` of the points (N, 3), evenly in time, the first and the last among them."""
+    if len(points) <= _TRUTH_POINTS:
+        return points
+    elapsed_ns = stamps_ns - stamps_ns[0]
+    wanted = np.linspace(0, elapsed_ns[-1], _TRUTH_POINTS).astype(np.int64)
+    kept: Array = points[np.unique(np.searchsorted(elapsed_ns, wanted))]
     return kept
 
 
@@ -296,10 +295,9 @@ def _blueprint(images: bool) -> Any:
         for title, names in plots.items()
     ]
     camera = [rrb.Spatial2DView(name="camera 0", origin="world/body/cam0")] if images else []
-    shares = [3, *([2] if images else []), 1]
     return rrb.Blueprint(
         rrb.Vertical(
-            rrb.Horizontal(world, *camera, rrb.TextLogView(name="status", origin="status"), column_shares=shares),
+            rrb.Horizontal(world, *camera, column_shares=[3, 2] if images else [1]),
             rrb.Grid(*views, grid_columns=3),
             row_shares=[3, 2],
         ),
