@@ -55,8 +55,8 @@ class KittiDataset(Dataset):
         gravity: float = 9.81,
         gyro_noise: float = 5e-4,
         gyro_walk: float = 1e-5,
-        accel_noise: float = 1e-2,
-        accel_walk: float = 5e-4,
+        accel_noise: float = 2e-2,
+        accel_walk: float = 1e-3,
     ) -> None:
         if cameras not in (1, 2):
             raise ConfigError(f"dataset.cameras must be 1 or 2, got {cameras}")
