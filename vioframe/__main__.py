@@ -59,6 +59,9 @@ def run_job(config: "DictConfig") -> None:
 
 def main() -> None:
     """Entry point of ``python -m vioframe`` and of the console script."""
+    # Matrices are small here: BLAS threads would only wait for each other, beside the thread that reads images.
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
     try:
         extend_hydra()
     except VioframeError as error:
