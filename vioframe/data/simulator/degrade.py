@@ -15,7 +15,7 @@ class Degradations:
         exposure_ramp: relative brightness swings between ``1 / (1 + x)`` and ``1 + x``.
         exposure_period_s: of the swing.
         flicker: relative brightness changes from frame to frame, standard deviation.
-        low_light: 0 … 1: share of the light that is missing; the noise of few photons comes with it.
+        low_light: 0 … 1: share of the light that is missing; the camera makes up for half of it, with more noise.
         motion_blur_s: exposure time, during which the scene is averaged.
         low_texture: 0 … 1: share of the contrast of surfaces that is missing.
         moving_objects: number of boxes that move through the scene.

@@ -18,8 +18,10 @@ from vioframe.geometry import camera as camera_models
 from vioframe.geometry import se3
 from vioframe.types import Camera
 
-# Photo-electrons of a full pixel in daylight: sets how much noise low light brings.
-_FULL_WELL = 8000.0
+# Photo-electrons of a full pixel, and noise of the read-out in grey values, of a small global-shutter sensor at
+# high gain: they set how much noise low light brings.
+_FULL_WELL = 2000.0
+_READ_NOISE_DN = 1.5
 _BLUR_SAMPLES = 7
 
 
@@ -144,19 +146,24 @@ class Imager:
         d = self._degradations
         # Of the instant, not of the order of calls: a frame is the same whenever it is drawn.
         rng = np.random.default_rng([self._seed, 30, camera, round(t_s * 1e6) + 10**9])
-        gain = 1.0 - d.low_light
+        gain = 1.0
         if d.exposure_ramp > 0.0:
             gain *= (1.0 + d.exposure_ramp) ** np.sin(2.0 * np.pi * t_s / d.exposure_period_s)
         if d.flicker > 0.0:
             gain *= float(np.exp(d.flicker * rng.standard_normal()))
-        light = grey * np.float32(gain)
-        noise = self._noise(rng, light.shape)
+        noise = self._noise(rng, grey.shape)
         if d.low_light > 0.0:
-            # Shot noise of the photo-electrons left, beside the sensor's own.
-            per_grey = 255.0 / _FULL_WELL
-            sigma = np.sqrt(np.maximum(light, 0.0) * np.float32(per_grey * 8.0) + np.float32(self._settings.noise_dn**2 + 4.0))
-            light += sigma * noise
-        elif self._settings.noise_dn > 0.0:
+            # The camera's own gain makes up for half (in stops) of the light that is missing, and raises the
+            # noise of the photo-electrons left and of the read-out with it.
+            left = 1.0 - d.low_light
+            amplified = left**-0.5
+            light = grey * np.float32(gain * left)
+            variance = np.maximum(light, 0.0) * np.float32(255.0 / _FULL_WELL)
+            variance += np.float32(self._settings.noise_dn**2 + _READ_NOISE_DN**2)
+            light += np.sqrt(variance) * noise
+            light *= np.float32(amplified)
+        else:
+            light = grey * np.float32(gain)
             light += np.float32(self._settings.noise_dn) * noise
         light += np.float32(0.5)
         np.clip(light, 0.0, 255.0, out=light)

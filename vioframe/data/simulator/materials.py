@@ -81,8 +81,6 @@ def ceiling(rng: np.random.Generator, shape: Shape, ppm: float) -> Image:
             panel = np.s_[ys[row] : ys[row + 1], xs[column] : xs[column + 1]]
             if row % 3 == 1 and column % 4 in (1, 2):
                 field[panel] = 250.0
-                if column % 4 == 1:
-                    field[panel][::, ::] -= 0.0
             elif rng.uniform() < 0.08:
                 field[panel] = 150.0
                 field[panel][:: max(int(0.05 * ppm), 2)] = 70.0
@@ -164,8 +162,7 @@ def window(rng: np.random.Generator, shape: Shape, ppm: float) -> Image:
     field = np.where(low, 70 + 28 * bushes, field)
     image = to_grey(field)
     bar = max(int(0.035 * ppm), 2)
-    for position in (0.5,):
-        cv2.line(image, (int(position * width), 0), (int(position * width), height), 235, bar)
+    cv2.line(image, (width // 2, 0), (width // 2, height), 235, bar)
     cv2.line(image, (0, int(0.35 * height)), (width, int(0.35 * height)), 235, bar)
     cv2.rectangle(image, (0, 0), (width - 1, height - 1), 240, 2 * bar)
     cv2.rectangle(image, (0, 0), (width - 1, height - 1), 110, max(bar // 3, 1))
@@ -284,12 +281,16 @@ def wall(rng: np.random.Generator, shape: Shape, ppm: float, *, windows: bool, b
             shade = image[top : min(bottom + int(0.03 * ppm), height), x : x + w + int(0.03 * ppm)]
             shade[...] = (shade * 0.75).astype(np.uint8)
             image[top:bottom, x : x + w] = painter(rng, (bottom - top, w), ppm)
-        if painter is picture and top > 1.0 * ppm:
-            # High walls get a second row.
+        # High walls get more rows: pictures, and a band of windows near the top.
+        while painter is not door and top > 0.9 * ppm:
+            high_up = height - top > 3.0 * ppm
             tall = int(rng.uniform(0.4, 0.8) * ppm)
-            upper = int(rng.uniform(0.1, 0.3) * ppm)
-            if top - upper - tall > 0:
-                image[top - upper - tall : top - upper, x : x + w] = picture(rng, (tall, w), ppm)
+            upper = int(rng.uniform(0.15, 0.5) * ppm)
+            if top - upper - tall < int(0.1 * ppm):
+                break
+            above = window if high_up and windows else picture
+            image[top - upper - tall : top - upper, x : x + w] = above(rng, (tall, w), ppm)
+            top -= upper + tall
         x += w + gap
     for _ in range(max(int(width / ppm / 2.5), 1)):
         left, top = int(rng.uniform(0, width - 0.1 * ppm)), height - int(0.38 * ppm)

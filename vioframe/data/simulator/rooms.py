@@ -171,7 +171,7 @@ class RoomBuilder:
             elif kind == 1:
                 size = np.array([0.3, 0.3, self._high[2] - self._low[2]]) * (*rng.uniform(0.8, 1.4, 2), 1.0)
                 low = self._somewhere(size)
-                placed = attempt % 2 == 0 and self._try(low, low + size, [*rng.choice(self._posters, 4)], self._tiled)
+                placed = attempt % 2 == 0 and self._try(low, low + size, self._tiled, self._tiled)
             else:
                 size = rng.uniform((0.3, 0.3, 0.3), (0.8, 0.8, 1.0))
                 low = self._somewhere(size)
