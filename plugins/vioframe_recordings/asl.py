@@ -125,6 +125,8 @@ class AslDataset(Dataset):
         name, part = split_part(sequence) if self.gap_policy == "split" else (sequence, None)
         folder = self._folder(name)
         findings: list[Finding] = []
+        streamed = self.camera_count if self.images else 1
+        stamps_ns, paths, stamps_file, missing = self._frames(folder, streamed, findings)
         imu, imu_file = read_imu(folder)
         noise, cameras, T_body_imu = self._calibration(folder, findings)
         findings += screening.check_samples(imu, str(imu_file), noise.rate_hz)
@@ -136,8 +138,6 @@ class AslDataset(Dataset):
         truth = self._truth(folder, T_body_imu, findings)
         if truth is not None:
             findings += screening.check_with_truth(imu, truth, str(imu_file))
-        streamed = self.camera_count if self.images else 1
-        stamps_ns, paths, stamps_file, missing = self._frames(folder, streamed, findings)
         covered, finding = screening.check_frame_clock(stamps_ns, imu, self.camera_delay_ns, str(stamps_file))
         findings.append(finding)
         kept = select_frames(stamps_ns, covered, self.every, self.start_s, self.duration_s, str(stamps_file))
@@ -316,7 +316,8 @@ def find_root(root: str | None, key: str) -> Path:
         ConfigError: not set.
         DataError: not there.
     """
-    if not root:
+    # An option left at ??? arrives as that text.
+    if not root or root == "???":
         raise ConfigError(f"dataset.root is not set: dataset={key} needs the folder that holds the sequences")
     path = Path(root).expanduser()
     if not path.is_dir():

@@ -216,6 +216,9 @@ def test_missing_folders(make_asl: Callable[..., Path], tmp_path: Path) -> None:
     make_asl()
     with pytest.raises(DataError, match=r"nowhere: no such folder \(dataset.root\)"):
         EurocDataset(root=str(tmp_path / "nowhere"))
+    for root in ("", "???"):
+        with pytest.raises(ConfigError, match=r"dataset.root is not set"):
+            EurocDataset(root=root)
     with pytest.raises(DataError, match=r"sequences under .*: swing"):
         EurocDataset(root=str(tmp_path), sequence="swung").open("swung")
     (tmp_path / "empty").mkdir()
