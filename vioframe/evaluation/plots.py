@@ -16,7 +16,7 @@ from vioframe.errors import MetricError
 from vioframe.evaluation.align import ALIGNMENTS, Alignment, MatchedPoses, Motion, align, align_first
 from vioframe.evaluation.metrics import StateErrors, initial_alignment, state_errors
 from vioframe.evaluation.protocol import EvaluationOptions, Protocol
-from vioframe.evaluation.rows import make_protocol, match, milliseconds_per_frame
+from vioframe.evaluation.rows import FARTHEST_M, make_protocol, match, milliseconds_per_frame
 from vioframe.evaluation.run import SequenceRun
 from vioframe.evaluation.states import StateColumns
 
@@ -226,6 +226,8 @@ def draw_top_view(drawing: Drawing) -> "Figure | None":
     if len(drawing.states) == 0:
         return None
     position = drawing.shown.apply(drawing.states.T_world_body)[:, :3, 3]
+    if np.abs(position).max() > FARTHEST_M:
+        return None
     truth = _shown_truth(drawing)
     figure = new_figure((8.2, 6.8))
     axes = figure.subplots()
@@ -246,8 +248,8 @@ def draw_top_view(drawing: Drawing) -> "Figure | None":
     low, high = position[:, :2].min(axis=0), position[:, :2].max(axis=0)
     if (high - low).max() < 0.2:
         centre = 0.5 * (low + high)
-        axes.set_xlim(centre[0] - 0.15, centre[0] + 0.15)
-        axes.set_ylim(centre[1] - 0.15, centre[1] + 0.15)
+        axes.update_datalim(np.stack([centre - 0.15, centre + 0.15]))
+        axes.autoscale_view()
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
     axes.set_title(f"{drawing.run.sequence}: path from above")
@@ -312,6 +314,7 @@ def draw_pose(drawing: Drawing) -> "Figure | None":
     panels[0, 1].set_title("Orientation")
     for axes in panels[2]:
         axes.set_xlabel("time (s)")
+    figure.align_ylabels()
     _legend(figure, panels[0, 0], drawing)
     add_caption(figure, drawing.caption(drawing.upright_name))
     return figure
@@ -351,11 +354,11 @@ def draw_errors(drawing: Drawing) -> "Figure | None":
             axes = panels[axis, column]
             _error_panel(axes, drawing, errors, values[:, axis] * factor, 3.0 * deviation[:, axis] * factor, smallest)
             axes.set_ylabel(f"{names[axis]} ({unit})")
-            axes.yaxis.set_label_coords(-0.09, 0.5)
     panels[0, 0].set_title(f"{drawing.run.sequence}: position error (world)")
     panels[0, 1].set_title("Orientation error (body)")
     for axes in panels[2]:
         axes.set_xlabel("time (s)")
+    figure.align_ylabels()
     _legend(figure, panels[0, 0], drawing)
     add_caption(figure, f"aligned: {drawing.protocol.nees_alignment} · {drawing.protocol.describe()}")
     return figure
@@ -415,6 +418,7 @@ def draw_biases(drawing: Drawing) -> "Figure | None":
             _shade(axes, drawing)
         panels[0, column].set_ylim(*_bias_limits(both))
         panels[2, column].set_xlabel("time (s)")
+    figure.align_ylabels()
     panels[0, 0].set_title(f"{drawing.run.sequence}: gyro bias")
     panels[0, 1].set_title("Accelerometer bias")
     _legend(figure, panels[0, 0], drawing)

@@ -19,6 +19,7 @@ from vioframe.evaluation.wording import (
     Line,
     accuracy_lines,
     counter_text,
+    failure_text,
     has_run,
     join,
     output_name,
@@ -148,10 +149,7 @@ def _parts_line(extra: Mapping[str, object] | None) -> str:
 
 
 def _failure(row: Row) -> str:
-    return (
-        f"<p class=failure><b>{escape(str(row['sequence']))}: {escape(str(row['status']))}.</b> "
-        f"{escape(str(row['error']))}</p>"
-    )
+    return f"<p class=failure><b>{escape(str(row['sequence']))}</b>: {escape(failure_text(row))}</p>"
 
 
 def _overview(rows: Sequence[Row]) -> str:

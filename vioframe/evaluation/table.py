@@ -9,6 +9,7 @@ from vioframe.evaluation.wording import (
     UNDEFINED,
     accuracy_lines,
     counter_text,
+    failure_text,
     has_run,
     join,
     output_name,
@@ -173,7 +174,7 @@ def _notes(row: Row, *, name: bool) -> "list[RenderableType]":
     prefix = f"{row['sequence']}: " if name else ""
     notes: list[RenderableType] = []
     if row.get("error"):
-        notes.append(Text(f"{prefix}{row['status']}: {row['error']}", style="bold red"))
+        notes.append(Text(prefix + failure_text(row), style="bold red"))
     counted = counter_text(row)
     if counted:
         notes.append(Text(f"{prefix}{counted}", style="yellow"))

@@ -137,6 +137,12 @@ def counter_text(row: Mapping[str, object]) -> str:
     return ", ".join(f"{name}: {count}" for name, count in counters.items())
 
 
+def failure_text(row: Mapping[str, object]) -> str:
+    """How a sequence ended that did not finish, and why."""
+    status, error = str(row["status"]), str(row["error"])
+    return error if error.startswith(status) else f"{status}: {error}"
+
+
 def output_name(row: Mapping[str, object]) -> str:
     """``causal``, ``final``, or ``file`` where only its author knows."""
     protocol = row.get("protocol")
