@@ -13,6 +13,7 @@ from vioframe.checks import Array, Stamps
 from vioframe_geometric.pose import View, pose_jacobian, stack_residuals
 
 # χ² of four and two degrees of freedom at 99.9 %.
+_REGULARITY = 0.01
 _GATE = {2: 13.8, 4: 18.5}
 
 
@@ -27,9 +28,21 @@ class Landmarks:
         covariance: (N, 3, 3) of q.
         strikes: (N,) observations rejected in a row.
         views: (N,) observations used.
+        prior_q, prior_information: (N, 3), (N, 3, 3) what is known of q besides the keyframes of the window.
     """
 
-    __slots__ = ("covariance", "ids", "min_inverse_depth", "origins", "q", "rotations", "strikes", "views")
+    __slots__ = (
+        "covariance",
+        "ids",
+        "min_inverse_depth",
+        "origins",
+        "prior_information",
+        "prior_q",
+        "q",
+        "rotations",
+        "strikes",
+        "views",
+    )
 
     def __init__(self, min_inverse_depth: float) -> None:
         """Make an empty set; no point is taken to be further away than ``1 / min_inverse_depth``."""
@@ -41,14 +54,17 @@ class Landmarks:
         self.covariance = np.zeros((0, 3, 3))
         self.strikes = np.zeros(0, dtype=np.int64)
         self.views = np.zeros(0, dtype=np.int64)
+        self.prior_q = np.zeros((0, 3))
+        self.prior_information = np.zeros((0, 3, 3))
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def keep(self, which: np.ndarray) -> None:
         """Drop all but a mask (N,)."""
-        for name in ("ids", "origins", "rotations", "q", "covariance", "strikes", "views"):
-            setattr(self, name, getattr(self, name)[which])
+        for name in self.__slots__:
+            if name != "min_inverse_depth":
+                setattr(self, name, getattr(self, name)[which])
 
     def add(self, ids: Stamps, T_map_cam: Array, ideal: Array, inverse_depth: Array, covariance: Array) -> None:
         """Add points first seen from ``T_map_cam`` (4, 4), with ids larger than any before.
@@ -68,6 +84,11 @@ class Landmarks:
         self.covariance = np.concatenate([self.covariance, covariance])
         self.strikes = np.concatenate([self.strikes, np.zeros(count, dtype=np.int64)])
         self.views = np.concatenate([self.views, np.ones(count, dtype=np.int64)])
+        self.prior_q = np.concatenate([self.prior_q, self.q[-count:] if count else self.q[:0]])
+        information = np.zeros((count, 3, 3))
+        # Enough to keep the equations regular where a point shows no parallax, too weak to bend the scale.
+        information[:, 2, 2] = _REGULARITY / covariance[:, 2, 2]
+        self.prior_information = np.concatenate([self.prior_information, information])
         order = np.argsort(self.ids, kind="stable")
         if np.any(order[1:] < order[:-1]):
             self.keep(order)
@@ -101,6 +122,16 @@ class Landmarks:
         """Covariance (M, 3, 3) of the positions."""
         slope = self.slopes(index)
         return slope @ self.covariance[index] @ np.swapaxes(slope, -1, -2)
+
+    def rescale(self, factor: float, centre: Array) -> None:
+        """Multiply all distances from ``centre`` (3,) by ``factor``."""
+        self.origins = centre + factor * (self.origins - centre)
+        self.q[:, 2] /= factor
+        self.prior_q[:, 2] /= factor
+        self.covariance[:, 2, :] /= factor
+        self.covariance[:, :, 2] /= factor
+        self.prior_information[:, 2, :] *= factor
+        self.prior_information[:, :, 2] *= factor
 
     def update(
         self,

@@ -16,7 +16,7 @@ from vioframe.types import Camera, Frame, Image, RelativePose, SensorRig, Tracks
 from vioframe_geometric.landmarks import Landmarks
 from vioframe_geometric.pose import View
 from vioframe_geometric.rays import Rays, observe
-from vioframe_geometric.tracking import locate, relative_covariance, select_view
+from vioframe_geometric.tracking import PixelNoise, locate, relative_covariance, select_view
 from vioframe_geometric.two_view import require_positive
 
 log = logging.getLogger(__name__)
@@ -51,6 +51,7 @@ class StereoVO(VOEstimator):
         self,
         *,
         sigma_px: float = 0.5,
+        adapt_sigma: bool = True,
         min_points: int = 12,
         min_depth: float = 0.4,
         window_px: int = 15,
@@ -75,7 +76,8 @@ class StereoVO(VOEstimator):
             raise ConfigError(f"vo.window_px must be odd and at least 5, got {window_px}")
         if not 0 <= levels <= 8:
             raise ConfigError(f"vo.levels must be from 0 to 8, got {levels}")
-        self._sigma = sigma_px
+        self._start_sigma = sigma_px
+        self._adapt = adapt_sigma
         self._min_points = min_points
         self._min_depth = min_depth
         self._window = window_px
@@ -105,6 +107,7 @@ class StereoVO(VOEstimator):
             forward_backward_px=self._back,
         )
         self._resets = 0
+        self._noise = PixelNoise(self._start_sigma)
         self._restart()
 
     def counters(self) -> Mapping[str, int]:
@@ -132,7 +135,7 @@ class StereoVO(VOEstimator):
             current.tracks.ids,
             views,
             [self._T_map_cam @ self._motion, self._T_map_cam],
-            sigma_px=self._sigma,
+            sigma_px=self._noise.sigma_px,
             min_inliers=self._min_points,
         )
         if fix is None:
@@ -142,6 +145,8 @@ class StereoVO(VOEstimator):
             self._extend(current.frame, current.tracks, views)
             self._stamp_ns = current.frame.stamp_ns
             return RelativePose.invalid()
+        if self._adapt:
+            self._noise.learn(fix.errors)
         T_prev_cur = se3.inverse(self._T_map_cam) @ fix.T_map_cam
         covariance = relative_covariance(self._pose_covariance, fix.covariance, T_prev_cur)
         self._T_map_cam, self._motion, self._pose_covariance = fix.T_map_cam, T_prev_cur, fix.covariance
@@ -149,7 +154,7 @@ class StereoVO(VOEstimator):
             fix.index,
             fix.T_map_cam,
             [select_view(view, fix.rows) for view in views],
-            sigma_px=self._sigma,
+            sigma_px=self._noise.sigma_px,
             pose_covariance=fix.covariance,
         )
         self._extend(current.frame, current.tracks, views)
@@ -200,7 +205,7 @@ class StereoVO(VOEstimator):
         slope = left.rows[:, :, :2] * depth[..., None]
         covariance = np.zeros((len(rows), 3, 3))
         inverse_slope = np.linalg.inv(slope)
-        covariance[:, :2, :2] = self._sigma**2 * inverse_slope @ np.swapaxes(inverse_slope, -1, -2)
+        covariance[:, :2, :2] = self._noise.sigma_px**2 * inverse_slope @ np.swapaxes(inverse_slope, -1, -2)
         covariance[:, 2, 2] = (1.0 / self._min_depth) ** 2
         ids = tracks.ids[rows]
         landmarks.add(ids, self._T_map_cam, ideal, inverse_depth, covariance)
@@ -210,7 +215,7 @@ class StereoVO(VOEstimator):
             index,
             self._T_map_cam,
             [View(rays=left, seen=nothing), View(rays=right, seen=~nothing)],
-            sigma_px=self._sigma,
+            sigma_px=self._noise.sigma_px,
         )
 
 

@@ -14,6 +14,10 @@ from vioframe_geometric.pose import PoseFit, View, fit_pose
 INLIER = 3.0
 # A pose that less than this share of the points agrees with is not believed.
 MIN_SHARE = 0.5
+# Median of √(χ²/2) with two degrees of freedom: √(ln 2).
+_MEDIAN_ERROR = float(np.sqrt(np.log(2.0)))
+_LEARN_RATE = 0.1
+_MIN_LEARN = 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -133,6 +137,28 @@ def _solve_pnp(points: Array, covariance: Array, view: View, sigma_px: float) ->
     T_map_cam = se3.inverse(se3.from_parts(R_cam_map, shift[:, 0]))
     T_map_cam[:3, 3] += centre
     return T_map_cam if np.isfinite(T_map_cam).all() else None
+
+
+class PixelNoise:
+    """Running estimate of the standard deviation of a pixel coordinate, from the errors of located images.
+
+    Args:
+        sigma_px: where it starts.
+        smallest_px, largest_px: its bounds.
+    """
+
+    def __init__(self, sigma_px: float, smallest_px: float = 0.08, largest_px: float = 2.0) -> None:
+        self._bounds = (min(smallest_px, sigma_px), max(largest_px, sigma_px))
+        self.sigma_px = sigma_px
+
+    def learn(self, errors: Array) -> None:
+        """Take the errors (M,) a degree of freedom of one image, normalised with the present estimate."""
+        if len(errors) < _MIN_LEARN:
+            return
+        ratio = float(np.median(errors)) / _MEDIAN_ERROR
+        # Slow, and limited a step, so that a few bad images change little.
+        change = np.clip(ratio, 0.5, 2.0) ** _LEARN_RATE
+        self.sigma_px = float(np.clip(self.sigma_px * change, *self._bounds))
 
 
 def relative_covariance(covariance_prev: Array, covariance_cur: Array, T_prev_cur: Array) -> Array:
