@@ -98,9 +98,7 @@ class ImuOnlyFuser(Fuser):
 
     def _move(self, filter_: InertialFilter, measurement: Measurement, delta: InertialDelta) -> None:
         options = self._inertial
-        if options.noise_scale != 1.0:
-            # Integrating again would give the unscaled covariance back.
-            delta = replace(delta, covariance=options.noise_scale**2 * delta.covariance, reintegrate=None)
+        delta = options.scaled(delta)
         window = measurement.window
         if window.gap_ns > self._gap_allowed_ns:
             self._counts["windows with inertial gaps"] += 1
