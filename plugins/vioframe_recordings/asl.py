@@ -240,6 +240,11 @@ class AslDataset(Dataset):
         if beside.exists():
             T_sensor_imu = se3.inverse(read_extrinsics(beside)) @ T_body_imu
         findings.append(_good("ground truth file", str(path)))
+        others = [name for name in self.profile.truth_files if name != "default"]
+        better = next((name for name in others if has_truth(folder, name, self.profile.truth_files)), None)
+        if self.truth_choice == "default" and better is not None:
+            text = f"{better} ground truth lies beside it: dataset.ground_truth={better} takes that"
+            findings.append(_note("ground truth choice", text))
         return replace(truth, T_world_body=truth.T_world_body @ T_sensor_imu)
 
     def _frames(
@@ -497,6 +502,11 @@ def match_stamps(left_ns: Stamps, right_ns: Stamps) -> tuple[np.ndarray, np.ndar
     return np.flatnonzero(close), nearest[close]
 
 
+def has_truth(folder: Path, name: str, known: Mapping[str, tuple[str, ...]]) -> bool:
+    """Whether a named ground truth is there."""
+    return any(True for pattern in known[name] for _ in folder.glob(pattern))
+
+
 def find_truth(folder: Path, choice: str, known: Mapping[str, tuple[str, ...]]) -> Path | None:
     """File of the ground truth: by name (``default``, ``corrected``), ``none``, or a path under ``mav0``.
 
@@ -511,7 +521,7 @@ def find_truth(folder: Path, choice: str, known: Mapping[str, tuple[str, ...]]) 
             return found[0]
     if choice == "default":
         return None
-    names = sorted({name for name, patterns in known.items() if any(list(folder.glob(p)) for p in patterns)})
+    names = sorted(name for name in known if has_truth(folder, name, known))
     raise DataError(
         f"{folder}: dataset.ground_truth={choice} is not in this recording; it has {', '.join(names) or 'none'}: "
         "take one of them, a file under mav0, or none"

@@ -304,6 +304,7 @@ def test_truth_choices(make_asl: Maker) -> None:
     (mav0 / "gt_openvins_swing_corrected.csv").write_text(truth_file.read_text())
     truth = opened(mav0).ground_truth()
     assert truth is not None and len(truth) == 600 and truth.v_world_body is not None
+    assert "dataset.ground_truth=corrected" in levels(opened(mav0), "note")["ground truth choice"]
     assert opened(mav0, ground_truth="none").ground_truth() is None
     assert opened(mav0, ground_truth="corrected").ground_truth() is not None
     assert opened(mav0, ground_truth="gt_openvins_swing_corrected.csv").ground_truth() is not None
