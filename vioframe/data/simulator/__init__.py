@@ -7,4 +7,12 @@ from vioframe.data.simulator.imu import ImuSettings
 from vioframe.data.simulator.recording import SimulatedRecording
 from vioframe.data.simulator.replay import ReplayDataset, ReplayRecording
 
-__all__ = ["CameraSettings", "Degradations", "ImuSettings", "ReplayDataset", "ReplayRecording", "SimulatedDataset", "SimulatedRecording"]
+__all__ = [
+    "CameraSettings",
+    "Degradations",
+    "ImuSettings",
+    "ReplayDataset",
+    "ReplayRecording",
+    "SimulatedDataset",
+    "SimulatedRecording",
+]

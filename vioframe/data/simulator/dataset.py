@@ -1,6 +1,6 @@
 """``dataset=simulated``: sequences named ``<family>-<seed>``."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from vioframe.conventions import GRAVITY
 from vioframe.data.recording import Dataset
@@ -49,7 +49,7 @@ class SimulatedDataset(Dataset):
         degradations: Degradations | None = None,
     ) -> None:
         families = [sequence] if isinstance(sequence, str) else list(sequence)
-        seeds = [seed] if isinstance(seed, int) else list(seed)
+        seeds = list(seed) if isinstance(seed, Iterable) else [seed]
         if not families or not seeds:
             raise ConfigError("dataset.sequence and dataset.seed must name at least one family and one seed")
         if split not in _SPLITS:

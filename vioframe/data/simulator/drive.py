@@ -18,11 +18,11 @@ _ACCELERATION, _BRAKING = 1.7, 2.0
 def plan_drive(rng: np.random.Generator, duration_s: float, standstill_s: float) -> PlannedMotion:
     """Through a town at 8 to 15 m/s, slower around corners; planar, starting along x."""
     cruise = rng.uniform(10.0, 14.0)
-    path = _path(rng, cruise * duration_s + 100.0)
-    distance = _distance(path, cruise, max(duration_s - standstill_s, 0.0) + 5.0)
+    path = _path(rng, cruise * duration_s + 200.0)
+    distance = _distance(path, cruise, duration_s + 30.0)
     times = control_times(duration_s, _KNOT_S)
     rests = [(-10.0, standstill_s)] if standstill_s > 0.0 else []
-    travelled = np.interp(own_time(times, rests), np.arange(len(distance)) * 0.02, distance)
+    travelled = np.interp(own_time(times, rests, _KNOT_S), np.arange(len(distance)) * 0.02, distance)
     if standstill_s == 0.0:
         # Already under way, as most recordings of cars are.
         lead = int(np.searchsorted(distance, 60.0))

@@ -64,14 +64,14 @@ def rotation_from_angles(yaw: Array, pitch: Array, roll: Array) -> Array:
     return turn @ nod @ lean
 
 
-def own_time(t_s: Array, rests: list[tuple[float, float]]) -> Array:
+def own_time(t_s: Array, rests: list[tuple[float, float]], knot_s: float = _KNOT_S) -> Array:
     """Time (N,) that stops during the rests (from, to) in s, and slows and speeds up smoothly around them."""
     grid = np.arange(min(t_s.min(), 0.0) - 1.0, t_s.max() + 1.0, 0.01)
     rate = np.ones_like(grid)
     for start, end in rests:
         # The spline looks three knots ahead and behind, so it rests only well inside a constant stretch.
-        before = np.clip((start - grid) / _RAMP_S, 0.0, 1.0)
-        after = np.clip((grid - (end + 0.3)) / _RAMP_S, 0.0, 1.0)
+        before = np.clip((start - 3.0 * knot_s - grid) / _RAMP_S, 0.0, 1.0)
+        after = np.clip((grid - (end + 3.0 * knot_s)) / _RAMP_S, 0.0, 1.0)
         gate = np.maximum(before, after)
         rate = np.minimum(rate, gate * gate * (3.0 - 2.0 * gate))
     elapsed = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * 0.01)])

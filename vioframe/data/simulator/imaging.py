@@ -58,6 +58,7 @@ class Imager:
         seed: of noise and flicker.
         world_seed: of the place.
         duration_s: the world leaves room for the motion this long.
+        world_plan: a place of one's own, instead of the one that suits the motion.
     """
 
     def __init__(
@@ -171,9 +172,9 @@ class Imager:
         return image
 
     def _noise(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-        """Unit white noise (H, W) float32: windows of one large sheet, since drawing it anew costs as much as the scene."""
+        """Unit white noise (H, W) float32: windows of one large sheet, since drawing it anew takes too long."""
         height, width = shape
-        if self._noise_tile is None or self._noise_tile.shape[0] < 2 * height or self._noise_tile.shape[1] < 2 * width:
+        if self._noise_tile is None or any(have < 2 * n for have, n in zip(self._noise_tile.shape, shape, strict=True)):
             sheet = np.random.default_rng([self._seed, 31])
             self._noise_tile = sheet.standard_normal((2 * height, 2 * width), dtype=np.float32)
         y, x = int(rng.integers(height)), int(rng.integers(width))

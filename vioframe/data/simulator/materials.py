@@ -1,5 +1,7 @@
 """Pictures of indoor surfaces, painted from noise: each takes a generator, a size in pixels and pixels a metre."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 
@@ -19,7 +21,8 @@ def plaster(rng: np.random.Generator, shape: Shape, ppm: float, base: float = 16
         x, y = int(rng.integers(shape[1])), int(rng.integers(shape[0]))
         tone = int(base + rng.choice([-1, 1]) * rng.uniform(18, 60))
         size = rng.uniform(0.004, 0.03) * ppm
-        cv2.ellipse(image, (x, y), (int(size) + 1, int(size * rng.uniform(0.3, 1)) + 1), rng.uniform(0, 180), 0, 360, tone, -1, cv2.LINE_AA)
+        axes = int(size) + 1, int(size * rng.uniform(0.3, 1)) + 1
+        cv2.ellipse(image, (x, y), axes, rng.uniform(0, 180), 0, 360, tone, -1, cv2.LINE_AA)
     for _ in range(int(0.7 * area)):
         start = rng.uniform(0, 1, 2) * shape[::-1]
         walk = np.cumsum(rng.normal(0, 0.04 * ppm, (8, 2)) + rng.normal(0, 0.05 * ppm, 2), axis=0)
@@ -35,7 +38,7 @@ def planks(rng: np.random.Generator, shape: Shape, ppm: float, base: float = 120
     grain = fractal_noise(rng, (height, max(columns // 12, 4)), 0.02 * ppm, 3, 0.8)
     field = base + 9.0 * cv2.resize(grain, (columns, height), interpolation=cv2.INTER_LINEAR)
     field += 5.0 * fractal_noise(rng, shape, 0.5 * ppm, 2)
-    for top, bottom in zip(edges[:-1], edges[1:], strict=True):
+    for top, bottom in pairwise(edges):
         x = -rng.uniform(0, 1.2) * ppm
         while x < columns:
             length = rng.uniform(0.7, 1.6) * ppm
@@ -105,8 +108,8 @@ def fabric(rng: np.random.Generator, shape: Shape, ppm: float, base: float = 110
     field += 10.0 * fractal_noise(rng, shape, 0.6 * ppm, 2)
     border = int(0.08 * ppm)
     if min(shape) > 6 * border > 0:
-        cv2.rectangle(field, (border, border), (width - border, height - border), base + 80, max(border // 3, 1))
-        cv2.rectangle(field, (2 * border, 2 * border), (width - 2 * border, height - 2 * border), base - 60, max(border // 4, 1))
+        for inset, tone in ((border, base + 80), (2 * border, base - 60)):
+            cv2.rectangle(field, (inset, inset), (width - inset, height - inset), tone, max(border // 3, 1))
     return to_grey(field)
 
 
@@ -177,13 +180,18 @@ def door(rng: np.random.Generator, shape: Shape, ppm: float) -> Image:
     frame = max(int(0.07 * ppm), 2)
     cv2.rectangle(image, (0, 0), (width - 1, height + frame), int(np.clip(base + 45, 0, 255)), 2 * frame)
     cv2.rectangle(image, (frame, frame), (width - frame, height + frame), int(base * 0.5), 2)
+    inset = int(0.2 * width)
     for top, bottom in ((0.12, 0.45), (0.55, 0.92)):
-        inset = int(0.2 * width)
-        cv2.rectangle(image, (inset, int(top * height)), (width - inset, int(bottom * height)), int(base * 0.6), 3)
-        cv2.rectangle(image, (inset + 4, int(top * height) + 4), (width - inset - 4, int(bottom * height) - 4), int(min(base * 1.2, 255)), 2)
-    cv2.rectangle(image, (int(0.82 * width), int(0.49 * height)), (int(0.92 * width), int(0.51 * height)), 30, -1)
-    cv2.rectangle(image, (int(0.4 * width), int(0.2 * height)), (int(0.6 * width), int(0.25 * height)), 240, -1)
-    cv2.rectangle(image, (int(0.43 * width), int(0.215 * height)), (int(0.57 * width), int(0.225 * height)), 40, -1)
+        for off, tone in ((0, base * 0.6), (4, min(base * 1.2, 255))):
+            corner = inset + off, int(top * height) + off
+            cv2.rectangle(image, corner, (width - inset - off, int(bottom * height) - off), int(tone), 3 - off // 4)
+    for left, top, right, bottom, tone in (
+        (0.82, 0.49, 0.92, 0.51, 30),
+        (0.40, 0.20, 0.60, 0.25, 240),
+        (0.43, 0.215, 0.57, 0.225, 40),
+    ):
+        corner = int(left * width), int(top * height)
+        cv2.rectangle(image, corner, (int(right * width), int(bottom * height)), tone, -1)
     return image
 
 
@@ -194,7 +202,7 @@ def books(rng: np.random.Generator, shape: Shape, ppm: float) -> Image:
     board = max(int(0.025 * ppm), 2)
     shelves = max(round(height / (0.34 * ppm)), 1)
     edges = np.linspace(0, height, shelves + 1).astype(int)
-    for top, bottom in zip(edges[:-1], edges[1:], strict=True):
+    for top, bottom in pairwise(edges):
         x = board
         while x < width - board:
             if rng.uniform() < 0.08:
@@ -294,8 +302,9 @@ def wall(rng: np.random.Generator, shape: Shape, ppm: float, *, windows: bool, b
         x += w + gap
     for _ in range(max(int(width / ppm / 2.5), 1)):
         left, top = int(rng.uniform(0, width - 0.1 * ppm)), height - int(0.38 * ppm)
-        cv2.rectangle(image, (left, top), (left + int(0.08 * ppm), top + int(0.08 * ppm)), 235, -1)
-        cv2.circle(image, (left + int(0.04 * ppm), top + int(0.04 * ppm)), max(int(0.025 * ppm), 1), 130, -1, cv2.LINE_AA)
+        size = int(0.08 * ppm)
+        cv2.rectangle(image, (left, top), (left + size, top + size), 235, -1)
+        cv2.circle(image, (left + size // 2, top + size // 2), max(size // 3, 1), 130, -1, cv2.LINE_AA)
     return image
 
 

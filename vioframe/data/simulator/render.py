@@ -405,7 +405,10 @@ class Renderer:
 
 
 def _bounds_at_depth_one(corners: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Bounds x0, y0, x1, y1 (F,) at depth one of quadrangles (F, 4, 3) in the camera, cut at the near plane, and nearest depth."""
+    """Bounds x0, y0, x1, y1 (F,) at depth one, and least depth, of quadrangles (F, 4, 3) in the camera frame.
+
+    They are cut at the near plane first.
+    """
     following = np.roll(corners, -1, axis=1)
     z0, z1 = corners[..., 2], following[..., 2]
     crossing = (z0 > _NEAR_M) != (z1 > _NEAR_M)

@@ -266,9 +266,9 @@ class ReplayRecording(Recording):
             )
         return self._imager
 
-    def elapsed_s(self, stamps_ns: Stamps) -> Array:
+    def elapsed_s(self, stamps_ns: Stamps | int) -> Array:
         """Time (N,) in s on the motion of stamps on the IMU clock."""
-        return (stamps_ns - self._origin_ns) / NANOSECONDS
+        return np.asarray(stamps_ns - self._origin_ns) / NANOSECONDS
 
     def packets(self) -> Iterator[Packet]:
         """Stream the replayed part: an image arrives with the first sample at or after it."""
@@ -299,7 +299,7 @@ class ReplayRecording(Recording):
         begin_ns, end_ns = self._span_ns
         return InertialSensor(
             settings,
-            motion=_Shifted(self.motion, float(self.elapsed_s(np.int64(begin_ns)))),
+            motion=_Shifted(self.motion, float(self.elapsed_s(begin_ns))),
             gravity=self._rig.gravity,
             start_ns=begin_ns,
             duration_s=(end_ns - begin_ns) / NANOSECONDS,

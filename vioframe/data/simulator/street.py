@@ -3,15 +3,12 @@
 from collections.abc import Callable
 from functools import partial
 
-import cv2
 import numpy as np
 
 from vioframe.checks import Array
-from vioframe.data.simulator.texture import Texture, fractal_noise, to_grey
+from vioframe.data.simulator import outdoors
+from vioframe.data.simulator.texture import Texture, to_grey
 from vioframe.data.simulator.world import Skin, WorldPlan
-
-Image = np.ndarray
-Shape = tuple[int, int]
 
 LANE_M = 1.75
 """From the middle of the road to the path of who drives on its right."""
@@ -23,170 +20,7 @@ _CAR_M = np.array([4.2, 1.7])
 _STRAIGHT_RAD = 0.02
 
 
-def asphalt(rng: np.random.Generator, shape: Shape, ppm: float) -> Image:
-    """Worn asphalt: aggregate, patches, cracks, manholes, tyre marks."""
-    height, width = shape
-    field = 98.0 + 7.0 * fractal_noise(rng, shape, 3.0 * ppm, 4) + 9.0 * rng.standard_normal(shape, dtype=np.float32)
-    field += 7.0 * fractal_noise(rng, shape, 0.25 * ppm, 3, 0.8)
-    area = height * width / ppm**2
-    for _ in range(int(0.05 * area)):
-        x, y = int(rng.integers(width)), int(rng.integers(height))
-        w, h = (int(v * ppm) for v in rng.uniform(0.4, 2.5, 2))
-        field[y : y + h, x : x + w] += rng.choice([-1, 1]) * rng.uniform(8, 26)
-    image = to_grey(field)
-    for _ in range(int(0.12 * area)):
-        start = rng.uniform(0, 1, 2) * shape[::-1]
-        walk = np.cumsum(rng.normal(0, 0.15 * ppm, (14, 2)) + rng.normal(0, 0.12 * ppm, 2), axis=0)
-        cv2.polylines(image, [(start + walk).astype(np.int32)], False, int(rng.uniform(35, 60)), int(rng.integers(1, 4)), cv2.LINE_AA)
-    for _ in range(int(0.012 * area)):
-        centre = int(rng.integers(width)), int(rng.integers(height))
-        cv2.circle(image, centre, int(0.33 * ppm), 55, -1, cv2.LINE_AA)
-        cv2.circle(image, centre, int(0.28 * ppm), 90, 2, cv2.LINE_AA)
-        for offset in range(-3, 4):
-            y = centre[1] + int(offset * 0.07 * ppm)
-            cv2.line(image, (centre[0] - int(0.2 * ppm), y), (centre[0] + int(0.2 * ppm), y), 95, 2)
-    return image
-
-
-def pavement(rng: np.random.Generator, shape: Shape, ppm: float) -> Image:
-    """Paving slabs."""
-    from vioframe.data.simulator import materials
-
-    return materials.tiles(rng, shape, ppm, 150.0, 0.5)
-
-
-def facade(rng: np.random.Generator, shape: Shape, ppm: float) -> Image:
-    """A house front, 3 m a storey, with windows, sills, a door and shop windows below."""
-    height, width = shape
-    base = float(rng.uniform(105, 205))
-    field = base + 6.0 * fractal_noise(rng, shape, 2.0 * ppm, 4) + 4.0 * fractal_noise(rng, shape, 0.1 * ppm, 2, 0.9)
-    if rng.uniform() < 0.5:
-        course = max(round(0.09 * ppm), 3)
-        field[::course] -= 26
-        brick = max(round(0.26 * ppm), 6)
-        for row, y in enumerate(range(0, height, course)):
-            field[y : y + course, (row % 2) * brick // 2 :: brick] -= 26
-            field[y : y + course] += rng.normal(0, 5)
-    image = to_grey(field)
-    storey, bays = 3.0 * ppm, max(round(width / ppm / rng.uniform(2.0, 3.2)), 2)
-    frame = int(rng.choice([235, 60, 215]))
-    for floor in range(max(int(height / storey), 1)):
-        bottom = height - int(floor * storey)
-        cv2.line(image, (0, bottom - int(storey)), (width, bottom - int(storey)), int(base * 0.7), max(int(0.08 * ppm), 1))
-        for bay in range(bays):
-            left = int((bay + 0.22) * width / bays)
-            right = int((bay + 0.78) * width / bays)
-            top, sill = bottom - int(2.45 * ppm), bottom - int((0.9 if floor else 0.35) * ppm)
-            if floor == 0 and bay == bays // 2:
-                cv2.rectangle(image, (left, bottom - int(2.3 * ppm)), (right, bottom), int(rng.uniform(30, 90)), -1)
-                cv2.rectangle(image, (left, bottom - int(2.3 * ppm)), (right, bottom), frame, max(int(0.07 * ppm), 1))
-                continue
-            pane = rng.uniform(25, 80)
-            cv2.rectangle(image, (left, top), (right, sill), int(pane), -1)
-            if rng.uniform() < 0.6:
-                drop = int(rng.uniform(0.2, 0.9) * (sill - top))
-                cv2.rectangle(image, (left, top), (right, top + drop), int(rng.uniform(120, 210)), -1)
-            middle = (left + right) // 2
-            cv2.line(image, (middle, top), (middle, sill), frame, max(int(0.05 * ppm), 1))
-            cv2.line(image, (left, (2 * top + sill) // 3), (right, (2 * top + sill) // 3), frame, max(int(0.05 * ppm), 1))
-            cv2.rectangle(image, (left, top), (right, sill), frame, max(int(0.07 * ppm), 1))
-            cv2.rectangle(image, (left - int(0.1 * ppm), sill), (right + int(0.1 * ppm), sill + int(0.1 * ppm)), int(min(base + 40, 255)), -1)
-    return image
-
-
-def foliage(rng: np.random.Generator, shape: Shape, ppm: float) -> Image:
-    """Leaves in sun and shade."""
-    leaves = fractal_noise(rng, shape, 0.5 * ppm, 5, 0.85)
-    return to_grey(78.0 + 34.0 * leaves)
-
-
-def roof(rng: np.random.Generator, shape: Shape, ppm: float) -> Image:
-    """Tar paper or gravel."""
-    return to_grey(95.0 + 12.0 * fractal_noise(rng, shape, 0.5 * ppm, 4, 0.8))
-
-
-def car_side(rng: np.random.Generator, shape: Shape, ppm: float, colour: float = 140.0) -> Image:
-    """Doors, sills and two wheels."""
-    height, width = shape
-    base = colour
-    shade = np.linspace(1.1, 0.75, height, dtype=np.float32)[:, None]
-    image = to_grey(base * shade + 2.0 * fractal_noise(rng, shape, 0.5 * ppm, 3))
-    cv2.rectangle(image, (0, int(0.82 * height)), (width, height), 25, -1)
-    for position in (0.2, 0.8):
-        centre = int(position * width), int(0.7 * height)
-        cv2.circle(image, centre, int(0.31 * ppm), 20, -1, cv2.LINE_AA)
-        cv2.circle(image, centre, int(0.19 * ppm), 150, -1, cv2.LINE_AA)
-        cv2.circle(image, centre, int(0.06 * ppm), 50, -1, cv2.LINE_AA)
-    for position in (0.33, 0.53, 0.68):
-        cv2.line(image, (int(position * width), 0), (int(position * width), int(0.8 * height)), int(base * 0.45), 2)
-    for position in (0.47, 0.63):
-        x = int(position * width)
-        cv2.rectangle(image, (x, int(0.2 * height)), (x + int(0.12 * ppm), int(0.26 * height)), int(base * 0.3 + 60), -1)
-    return image
-
-
-def car_end(rng: np.random.Generator, shape: Shape, ppm: float, colour: float = 140.0) -> Image:
-    """Lights, grille and number plate."""
-    height, width = shape
-    base = colour
-    image = to_grey(base + 2.0 * fractal_noise(rng, shape, 0.5 * ppm, 3))
-    cv2.rectangle(image, (0, int(0.8 * height)), (width, height), 25, -1)
-    for left in (0.04, 0.76):
-        cv2.rectangle(image, (int(left * width), int(0.18 * height)), (int((left + 0.2) * width), int(0.4 * height)), 250, -1)
-        cv2.rectangle(image, (int(left * width), int(0.18 * height)), (int((left + 0.2) * width), int(0.4 * height)), 40, 2)
-    cv2.rectangle(image, (int(0.3 * width), int(0.22 * height)), (int(0.7 * width), int(0.42 * height)), 30, -1)
-    cv2.rectangle(image, (int(0.35 * width), int(0.55 * height)), (int(0.65 * width), int(0.68 * height)), 240, -1)
-    cv2.rectangle(image, (int(0.38 * width), int(0.58 * height)), (int(0.62 * width), int(0.65 * height)), 60, 2)
-    return image
-
-
-def car_glass(rng: np.random.Generator, shape: Shape, ppm: float, colour: float = 140.0) -> Image:
-    """Windows between pillars, reflecting the sky."""
-    height, width = shape
-    image = to_grey(np.linspace(95, 45, height, dtype=np.float32)[:, None] + 8.0 * fractal_noise(rng, shape, 0.4 * ppm, 3))
-    paint = int(colour)
-    for position in (0.0, 0.36, 0.68, 1.0):
-        x = int(position * (width - 1))
-        cv2.line(image, (x, 0), (x, height), paint, max(int(0.1 * ppm), 2))
-    cv2.rectangle(image, (0, 0), (width - 1, height - 1), paint, max(int(0.08 * ppm), 2))
-    return image
-
-
-def car_top(rng: np.random.Generator, shape: Shape, ppm: float, colour: float = 140.0) -> Image:
-    """Roof and bonnet: paint, seams, the reflection of clouds."""
-    image = to_grey(colour + 10.0 * fractal_noise(rng, shape, 0.8 * ppm, 2))
-    height, width = shape
-    for position in (0.08, 0.92):
-        y = int(position * height)
-        cv2.line(image, (0, y), (width, y), int(0.6 * colour), 2)
-    cv2.line(image, (int(0.5 * width), int(0.4 * height)), (int(0.5 * width), int(0.6 * height)), int(0.4 * colour), 3)
-    return image
-
-
-def paint(rng: np.random.Generator, shape: Shape, ppm: float) -> Image:
-    """Worn white paint."""
-    worn = fractal_noise(rng, shape, 0.3 * ppm, 5, 0.8)
-    return to_grey(np.where(worn > 1.3, 110.0, 222.0 + 8.0 * worn))
-
-
-def sky(rng: np.random.Generator, shape: Shape, ppm: float) -> Image:
-    """Clouds."""
-    clouds = fractal_noise(rng, shape, 120.0 * ppm, 6, 0.55)
-    return to_grey(214.0 + 22.0 * np.tanh(clouds))
-
-
-def horizon(rng: np.random.Generator, shape: Shape, ppm: float) -> Image:
-    """Hazy hills and roofs under the sky."""
-    height, width = shape
-    field = sky(rng, shape, ppm).astype(np.float32)
-    for tone, level, rough in ((188.0, 42.0, 10.0), (166.0, 24.0, 8.0)):
-        ridge = level + rough * fractal_noise(rng, (1, width), 90.0 * ppm, 6, 0.6)[0]
-        rows = (height - np.arange(height))[:, None] / ppm
-        field = np.where(rows < ridge[None, :], tone + 3.0 * fractal_noise(rng, shape, 8.0 * ppm, 3), field)
-    return to_grey(field)
-
-
-Painter = Callable[[np.random.Generator, Shape, float], Image]
+Painter = Callable[[np.random.Generator, tuple[int, int], float], np.ndarray]
 
 
 class StreetBuilder:
@@ -215,25 +49,25 @@ class StreetBuilder:
             self._cells[key] = path[(keys[:, 0] == key[0]) & (keys[:, 1] == key[1]), :2]
         self._built: dict[tuple[int, int], list[int]] = {}
         texture = self._texture
-        self._asphalt = texture(asphalt, 24.0, 24.0, 56.0)
-        self._pavement = texture(pavement, 4.0, 4.0, 64.0)
-        self._facades = [texture(facade, 15.0, 15.0, 56.0) for _ in range(7)]
-        self._roof = texture(roof, 6.0, 6.0, 24.0)
-        self._leaves = [texture(foliage, 3.0, 3.0, 64.0) for _ in range(2)]
+        self._asphalt = texture(outdoors.asphalt, 24.0, 24.0, 56.0)
+        self._pavement = texture(outdoors.pavement, 4.0, 4.0, 64.0)
+        self._facades = [texture(outdoors.facade, 15.0, 15.0, 56.0) for _ in range(7)]
+        self._roof = texture(outdoors.roof, 6.0, 6.0, 24.0)
+        self._leaves = [texture(outdoors.foliage, 3.0, 3.0, 64.0) for _ in range(2)]
         self._cars = [
             tuple(
                 texture(partial(painter, colour=colour), width, height, 90.0)
                 for painter, width, height in (
-                    (car_side, float(_CAR_M[0]), 0.85),
-                    (car_end, float(_CAR_M[1]), 0.85),
-                    (car_glass, 2.3, 0.6),
-                    (car_top, 2.3, 1.5),
+                    (outdoors.car_side, float(_CAR_M[0]), 0.85),
+                    (outdoors.car_end, float(_CAR_M[1]), 0.85),
+                    (outdoors.car_glass, 2.3, 0.6),
+                    (outdoors.car_top, 2.3, 1.5),
                 )
             )
             for colour in (40.0, 85.0, 140.0, 190.0, 228.0)
         ]
-        self._kiosks = [texture(facade, 2.0, 2.4, 90.0), texture(car_glass, 1.2, 1.6, 90.0)]
-        self._paint = texture(paint, 3.0, 3.0, 64.0)
+        self._kiosks = [texture(outdoors.facade, 2.0, 2.4, 90.0), texture(outdoors.car_glass, 1.2, 1.6, 90.0)]
+        self._paint = texture(outdoors.paint, 3.0, 3.0, 64.0)
 
     def _texture(self, painter: Painter, width_m: float, height_m: float, ppm: float) -> int:
         shape = round(height_m * ppm), round(width_m * ppm)
@@ -291,8 +125,8 @@ class StreetBuilder:
         """Lay the road, then line it."""
         low, high = self._path.min(axis=0) - 500.0, self._path.max(axis=0) + 500.0
         low[2], high[2] = self._ground, self._ground + 400.0
-        haze = Skin(texture=self._texture(horizon, 1000.0, 400.0, 1.6), origin=(0.0, float(high[2])))
-        clouds = Skin(texture=self._texture(sky, 800.0, 800.0, 0.8), origin=(0.0, 0.0))
+        haze = Skin(texture=self._texture(outdoors.horizon, 1000.0, 400.0, 1.6), origin=(0.0, float(high[2])))
+        clouds = Skin(texture=self._texture(outdoors.sky, 800.0, 800.0, 0.8), origin=(0.0, 0.0))
         road = Skin(texture=self._asphalt, origin=(0.0, 0.0))
         self.plan.add_solid(low, high, [haze, haze, haze, haze, road, clouds])
         steps = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self._path[:, :2], axis=0), axis=1))])
@@ -312,9 +146,11 @@ class StreetBuilder:
         quarter = heading / (0.5 * np.pi)
         if abs(quarter - round(quarter)) * 0.5 * np.pi > _STRAIGHT_RAD:
             return None
-        return int(round(quarter)) % 2
+        return round(quarter) % 2
 
-    def _span(self, point: Array, heading: float, forward: tuple[float, float], left: tuple[float, float]) -> tuple[Array, Array]:
+    def _span(
+        self, point: Array, heading: float, forward: tuple[float, float], left: tuple[float, float]
+    ) -> tuple[Array, Array]:
         """Corners in the plane of a rectangle given along and left of a heading; its bounds where that is askew."""
         direction = np.array([np.cos(heading), np.sin(heading)])
         sideways = np.array([-direction[1], direction[0]])

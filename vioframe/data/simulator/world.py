@@ -160,10 +160,9 @@ class World:
 
     def clearance(self, points: Array) -> Array:
         """Distance (N,) m from points (N, 3) to the nearest surface; negative outside the shell or inside a solid."""
-        inside = np.minimum(points - self.low[0], self.high[0] - points).min(axis=1)
+        nearest: Array = np.minimum(points - self.low[0], self.high[0] - points).min(axis=1)
         if len(self.low) == 1:
-            return inside
-        nearest = inside
+            return nearest
         for begin in range(0, len(points), 256):
             part = slice(begin, begin + 256)
             gap = np.maximum(self.low[None, 1:] - points[part, None], points[part, None] - self.high[None, 1:])
