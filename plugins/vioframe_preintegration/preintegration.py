@@ -152,8 +152,11 @@ class Preintegration(InertialIntegrator):
         levers[:, :3] = R_last.T
         levers[:, 3:6] = -so3.hat(later[0])
         levers[:, 6:] = -so3.hat(later[1])
-        gains = levers @ (spread * (noise.gyro_noise / np.sqrt(steps))[:, None, None])
-        flat = gains.transpose(1, 0, 2).reshape(9, -1)
+        # Written row by row, so that the sum over samples is one product of two flat matrices.
+        gains = np.empty((9, len(steps), 3))
+        scaled = spread * (noise.gyro_noise / np.sqrt(steps))[:, None, None]
+        np.matmul(levers, scaled, out=gains.transpose(1, 0, 2))
+        flat = gains.reshape(9, -1)
         covariance += flat @ flat.T
         # Accelerometer noise only turns with R, so its part is isotropic: ∫ dt, ∫ (T − t) dt, ∫ (T − t)² dt.
         strength = noise.accel_noise**2

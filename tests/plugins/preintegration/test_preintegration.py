@@ -207,7 +207,7 @@ def test_one_sample_is_no_motion(integrator: InertialIntegrator) -> None:
     assert delta.duration_s == 0.0 and not delta.delta_v.any() and not delta.covariance.any()
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 9, 1000])
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 9, 64, 65, 66, 131, 1000, 1001])
 def test_the_scan_equals_the_loop(count: int) -> None:
     from vioframe_preintegration.rotations import cumulative_products
 
