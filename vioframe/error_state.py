@@ -302,6 +302,47 @@ class StandstillTest:
         )
 
 
+class NoiseAdaptation:
+    """Raises the inertial noise while the odometry contradicts it more than both allow.
+
+    Data sheets state the noise of a sensor that does not shake. On a vehicle the white noise is larger, by a
+    factor that depends on the vehicle, and a filter that believes the data sheet refuses good odometry. Here
+    the logarithm of a variance factor follows the innovations (after Mehra, "Approaches to adaptive filtering",
+    IEEE TAC 1972): with χ² that of a block of three, over τ seconds it moves by ``min(χ²/3, 9) − 1.3``, never
+    below zero. A filter whose noise is as stated has a mean of 1, so its factor stays at 1.
+
+    Args:
+        time_s: τ.
+        most: largest factor on a standard deviation; 1 adapts nothing.
+    """
+
+    _TARGET = 1.3
+    _CAP = 9.0
+
+    def __init__(self, time_s: float, most: float) -> None:
+        self._time_s = time_s
+        self._most = 2.0 * float(np.log(most))
+        self._logs = np.zeros(2)
+
+    @property
+    def gyro(self) -> float:
+        """Factor on the gyro's noise."""
+        return float(np.exp(0.5 * self._logs[0]))
+
+    @property
+    def accel(self) -> float:
+        """Factor on the accelerometer's noise: what shakes one sensor shakes both."""
+        return float(np.exp(0.5 * self._logs.max()))
+
+    def learn(self, residual: Array, S: Array, duration_s: float) -> None:
+        """Take the innovation (6,), ordered (rotation, translation), of one window, and its covariance (6, 6)."""
+        squares = np.array(
+            [residual[part] @ np.linalg.solve(S[part, part], residual[part]) for part in (slice(0, 3), slice(3, 6))]
+        )
+        step = np.minimum(squares / 3.0, self._CAP) - self._TARGET
+        self._logs = np.clip(self._logs + duration_s / self._time_s * step, 0.0, self._most)
+
+
 class InertialFilter:
     """Body, covariance and the two steps of a Kalman filter; a plugin appends its own errors.
 

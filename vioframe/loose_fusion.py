@@ -14,6 +14,7 @@ from vioframe.checks import Array
 from vioframe.conventions import NANOSECONDS, seconds
 from vioframe.error_state import (
     InertialFilter,
+    NoiseAdaptation,
     StandstillTest,
     add_gap,
     chi_square_limit,
@@ -55,27 +56,50 @@ class InertialOptions:
     """How far the inertial increments are believed.
 
     Attributes:
-        noise_scale: factor on the white noise densities of the rig.
+        gyro_noise_scale: factor on the gyro's white noise density of the rig.
+        accel_noise_scale: factor on the accelerometer's.
         walk_scale: factor on the bias walk densities of the rig.
+        adapt_most: up to this factor the noise is raised while the odometry contradicts it; 1 for never.
+        adapt_s: seconds in which it is.
         gap_allowed_s: a longer hole between samples widens the covariance.
         gap_rate_sigma: rad/s, unknown rate inside such a hole.
         gap_accel_sigma: m/s², unknown acceleration inside such a hole.
     """
 
-    noise_scale: float = 1.0
+    gyro_noise_scale: float = 1.0
+    accel_noise_scale: float = 1.0
     walk_scale: float = 1.0
+    adapt_most: float = 30.0
+    adapt_s: float = 0.3
     gap_allowed_s: float = 0.05
     gap_rate_sigma: float = 0.5
     gap_accel_sigma: float = 2.0
 
     def __post_init__(self) -> None:
-        _check_positive("inertial", noise_scale=self.noise_scale, gap_allowed_s=self.gap_allowed_s)
+        _check_positive(
+            "inertial",
+            gyro_noise_scale=self.gyro_noise_scale,
+            accel_noise_scale=self.accel_noise_scale,
+            adapt_s=self.adapt_s,
+            gap_allowed_s=self.gap_allowed_s,
+        )
+        if not self.adapt_most >= 1.0:
+            raise ConfigError(f"fuser.inertial.adapt_most must be at least 1, got {self.adapt_most}; 1 adapts nothing")
         _check_not_negative(
             "inertial",
             walk_scale=self.walk_scale,
             gap_rate_sigma=self.gap_rate_sigma,
             gap_accel_sigma=self.gap_accel_sigma,
         )
+
+    def scaled(self, delta: InertialDelta, adapted: NoiseAdaptation) -> InertialDelta:
+        """The increment with the scaled covariance; that of v and p is the accelerometer's, near enough."""
+        gyro, accel = self.gyro_noise_scale * adapted.gyro, self.accel_noise_scale * adapted.accel
+        if gyro == 1.0 and accel == 1.0:
+            return delta
+        factor = np.repeat([gyro, accel, accel], 3)
+        # Integrating again would give the unscaled covariance back.
+        return replace(delta, covariance=factor[:, None] * delta.covariance * factor, reintegrate=None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -319,6 +343,7 @@ class LooseFuser(Fuser):
         self._rest = self._start.at_rest(rig)
         self._standstill_test = self._standstill.test(rig)
         self._given: NavState | None = None
+        self._adapted = NoiseAdaptation(self._inertial.adapt_s, self._inertial.adapt_most)
         self._begun = False
         self._stamp_ns = 0
         self._supported_ns = 0
@@ -378,10 +403,7 @@ class LooseFuser(Fuser):
         delta = measurement.inertial_delta
         if delta is None:
             raise StateError(f"{type(self).__name__}.update needs an inertial increment: set integrator=preintegration")
-        if self._inertial.noise_scale != 1.0:
-            # Integrating again would give the unscaled covariance back.
-            covariance = self._inertial.noise_scale**2 * delta.covariance
-            delta = replace(delta, covariance=covariance, reintegrate=None)
+        delta = self._inertial.scaled(delta, self._adapted)
         if window.gap_ns > self._gap_allowed_ns:
             self._count("inertial gaps")
             delta = add_gap(

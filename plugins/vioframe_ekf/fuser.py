@@ -68,15 +68,17 @@ class EkfFuser(LooseFuser):
     def _advance(self, step: Step) -> bool:
         self._filter.clone_pose()
         self._filter.propagate(step.delta)
-        supported = step.motion is not None and self._fuse(step.motion)
+        supported = step.motion is not None and self._fuse(step.motion, step.delta.duration_s)
         if step.at_rest:
             supported = self._stand_still() or supported
         self._filter.drop_clone()
         return supported
 
-    def _fuse(self, motion: VisualMotion) -> bool:
+    def _fuse(self, motion: VisualMotion, duration_s: float) -> bool:
         H, residual, noise = relative_pose_measurement(self._filter, self._T_body_cam, motion)
-        if self._filter.innovation(H, residual, noise)[1] > self._gate:
+        S, chi_square = self._filter.innovation(H, residual, noise)
+        self._adapted.learn(residual, S, duration_s)
+        if chi_square > self._gate:
             self._count("gated VO updates")
             return False
         self._correct(H, residual, noise)

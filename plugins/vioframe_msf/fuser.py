@@ -38,11 +38,11 @@ class ScaleOptions:
         kept_by_vo: the VO keeps its unit through an interruption; if not, it is searched again after each.
     """
 
-    guess: float = 1.0
+    guess: float = 5.0
     ratio: float = 30.0
     known_sigma: float = 0.1
     known_probability: float = 0.99
-    walk: float = 0.002
+    walk: float = 0.01
     kept_by_vo: bool = True
 
     def __post_init__(self) -> None:
@@ -105,6 +105,11 @@ class LateStep:
     deltas: tuple[InertialDelta, ...]
     motion: VisualMotion | None
     at_rest: bool
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the window."""
+        return sum(delta.duration_s for delta in self.deltas)
 
 
 class MsfFuser(LooseFuser):
@@ -223,7 +228,9 @@ class MsfFuser(LooseFuser):
         supported = False
         if image is not None:
             H, residual = state.vision_measurement()
-            if state.innovation(H, residual, image)[1] > self._gate:
+            S, chi_square = state.innovation(H, residual, image)
+            self._adapted.learn(residual, S, late.duration_s)
+            if chi_square > self._gate:
                 self._count("gated VO updates")
                 state.drop_vision()
             else:
@@ -243,7 +250,11 @@ class MsfFuser(LooseFuser):
             if image is not None:
                 H, residual = state.vision_measurement()
                 innovations.append((hypothesis, H, residual, image, *state.innovation(H, residual, image)))
-        supported = bool(innovations) and min(chi_square for *_, chi_square in innovations) <= self._gate
+        supported = False
+        if innovations:
+            _, _, residual, _, S, chi_square = min(innovations, key=lambda innovation: innovation[-1])
+            self._adapted.learn(residual, S, late.duration_s)
+            supported = chi_square <= self._gate
         for hypothesis, H, residual, image, S, chi_square in innovations:
             if not supported:
                 hypothesis.state.drop_vision()
