@@ -64,7 +64,7 @@ class LocalMapVO(VOEstimator):
         keyframe_parallax_px: float = 10.0,
         keyframe_share: float = 0.7,
         window: int = 8,
-        fixed: int = 1,
+        fixed: int = 2,
         drift_px: float = 0.05,
         covariance_scale: float = 1.0,
     ) -> None:
@@ -148,8 +148,8 @@ class LocalMapVO(VOEstimator):
         self._extend(tracks, view)
         if self._window and self._is_keyframe(tracks):
             self._add_keyframe(tracks, view)
-            fix = replace(fix, T_map_cam=self._T_map_cam)
-            self._fix = fix
+            self._fix = replace(fix, T_map_cam=self._T_map_cam)
+            return self._fix
         return fix
 
     def _is_keyframe(self, tracks: Tracks) -> bool:
