@@ -116,7 +116,7 @@ class BagDataset(Dataset):
         """
         calibrated_imu = read_imu(self._imu_calibration)
         calibrated = read_cameras(self._camera_calibration, calibrated_imu.T_body_imu)
-        findings = [_good("calibration", f"{self._imu_calibration.name}, {len(calibrated)} cameras calibrated")]
+        findings = [_good("calibration", f"noise from {self._imu_calibration.name}; cameras: {len(calibrated)}")]
         bag = Bag(self._bags[sequence])
         imu_topic, topics = self._topics(bag, calibrated_imu, calibrated, findings)
         contents = _collect(bag, imu_topic, topics, self._truth_topic)
@@ -183,7 +183,8 @@ class BagDataset(Dataset):
         topics = (self._camera_topics or named or [_only(bag, IMAGE, "dataset.camera_topics")])[:count]
         if len(topics) < count:
             raise ConfigError(
-                f"dataset.camera_topics={','.join(topics)} names {len(topics)} camera, but rig=stereo needs 2: name two"
+                f"dataset.camera_topics={topics[0]} names 1 camera, but rig=stereo needs 2: name both topics, or set "
+                "rig=mono"
             )
         if len(set(topics)) < len(topics):
             raise ConfigError(f"dataset.camera_topics names {topics[0]} twice: name two topics")

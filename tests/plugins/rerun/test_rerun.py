@@ -1,14 +1,17 @@
 """The Rerun viewer writes what a pipeline gave, readable again; it refuses what it cannot do before a run."""
 
 import importlib.util
+import inspect
 import socket
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 from vioframe.errors import ConfigError, StateError
 from vioframe.geometry import se3, so3
+from vioframe.plugins import core_conf
 from vioframe.types import (
     Camera,
     Frame,
@@ -23,6 +26,7 @@ from vioframe.types import (
     Trajectory,
     VisualFeatures,
 )
+from vioframe.viewer import build_viewer
 
 import vioframe_rerun.viewer as module
 from vioframe_rerun import RerunViewer
@@ -265,3 +269,16 @@ def test_options_out_of_range(options, monkeypatch):
     monkeypatch.setattr(module, "find_spec", lambda name: object())
     with pytest.raises(ConfigError, match=f"viewer.{next(iter(options))}"):
         RerunViewer(**options)
+
+
+@needs_rerun
+def test_configs_build_the_viewer_or_none():
+    path = Path(module.__file__).parent / "conf" / "viewer" / "rerun.yaml"
+    options = OmegaConf.load(path)
+    assert set(options) - {"_target_"} == set(inspect.signature(RerunViewer).parameters)
+    assert isinstance(build_viewer(OmegaConf.create({"viewer": options}), {"viewer": "rerun"}), RerunViewer)
+    nothing = OmegaConf.load(core_conf() / "viewer" / "none.yaml")
+    assert build_viewer(OmegaConf.create({"viewer": nothing}), {"viewer": "none"}) is None
+    options.every = -1
+    with pytest.raises(ConfigError, match="viewer.every"):
+        build_viewer(OmegaConf.create({"viewer": options}), {"viewer": "rerun"})
