@@ -402,6 +402,7 @@ def draw_chart(summary: Summary, path: Path) -> bool:
         return False
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     rows: list[tuple[str, list[JobResult], SeedGroup | None]]
     if summary.groups:
@@ -456,6 +457,7 @@ def draw_chart(summary: Summary, path: Path) -> bool:
         axis.margins(x=0.25)
         if not spread:
             axis.set_xlim(left=0.0)
+            axis.xaxis.set_major_locator(MaxNLocator(4))
     axes[0].set_ylim(len(rows) - 0.5, -0.5)
     if summary.groups:
         figure.suptitle("bars: median over seeds, dots: seeds", fontsize=9)

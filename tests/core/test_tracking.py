@@ -410,6 +410,26 @@ def test_two_processes_share_a_fresh_store_in_silence_and_without_a_network(
         assert connection.execute("SELECT count(*) FROM experiments WHERE name = 'vioframe'").fetchone() == (1,)
 
 
+def test_a_store_whose_creation_was_interrupted_can_still_be_created(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import mlflow.tracking
+
+    def interrupt(tracking_uri: str) -> None:
+        # As far as MLflow's own migrations may have come when Ctrl-C arrives.
+        with sqlite3.connect(tracking_uri.removeprefix("sqlite:///")) as connection:
+            connection.execute("CREATE TABLE experiments (half INTEGER)")
+        raise KeyboardInterrupt
+
+    uri = f"sqlite:///{tmp_path}/mlflow.db"
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(mlflow.tracking, "MlflowClient", interrupt)
+        create_store(uri)
+    assert not (tmp_path / "mlflow.db").exists()
+    assert create_store(uri) == create_store(uri)
+    assert {path.name for path in tmp_path.iterdir()} == {"mlflow.db", ".mlflow.db.lock"}
+
+
 # Names and numbers
 
 

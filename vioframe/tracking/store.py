@@ -3,12 +3,13 @@
 import logging
 import os
 import sqlite3
+import tempfile
 import threading
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -161,7 +162,7 @@ def _ask(uri: str, timeout_s: float) -> str | None:
 def create_store(uri: str, experiment: str = "vioframe", *, timeout_s: float = 5.0) -> str:
     """Create the store and the experiment unless they exist; safe against other processes that do the same.
 
-    A fresh SQLite store takes about 2 s (schema migrations), an existing one 0.8 s.
+    A fresh SQLite store takes about 2 s (schema migrations), an existing one 0.9 s.
 
     Args:
         uri: tracking URI, as ``check_uri`` returns it.
@@ -180,14 +181,49 @@ def create_store(uri: str, experiment: str = "vioframe", *, timeout_s: float = 5
         return _find_experiment(uri, experiment, None)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with _locked(path.with_name(f".{path.name}.lock")):
-            _check_sqlite(path)
-            return _find_experiment(uri, experiment, path.parent)
+        if _is_absent(path):
+            with _locked(path.with_name(f".{path.name}.lock")):
+                if _is_absent(path):
+                    _create_schema(path)
+        _check_sqlite(path)
+        return _find_experiment(uri, experiment, path.parent)
     except OSError as error:
         raise ConfigError(
             f"tracker.uri={uri} cannot be written ({error.strerror or error}): "
             "choose another path, or tracker=none to record nothing"
         ) from error
+
+
+def _is_absent(path: Path) -> bool:
+    return not path.exists() or path.stat().st_size == 0
+
+
+def _create_schema(path: Path) -> None:
+    """Create a fresh store in memory and move it to its place whole.
+
+    MLflow's hundred migrations each wait for the disk (5 s where it is busy), and a run that is stopped
+    among them would leave a file that MLflow refuses for good.
+    """
+    from mlflow.tracking import MlflowClient
+
+    memory = "/dev/shm"
+    partial = path.with_name(f".{path.name}.partial")
+    with tempfile.TemporaryDirectory(dir=memory if os.access(memory, os.W_OK) else None) as folder:
+        fresh = Path(folder) / "fresh.db"
+        try:
+            MlflowClient(tracking_uri=f"sqlite:///{fresh}").get_experiment_by_name("Default")
+        except client_errors() as error:
+            raise ConfigError(
+                f"tracker.uri=sqlite:///{path} cannot be created ({one_sentence(error)}): "
+                "choose a server, or tracker=none to record nothing"
+            ) from error
+        partial.unlink(missing_ok=True)
+        try:
+            with closing(sqlite3.connect(fresh)) as source, closing(sqlite3.connect(partial)) as target:
+                source.backup(target)
+        except sqlite3.Error as error:
+            raise OSError(str(error)) from error
+    partial.replace(path)
 
 
 def _find_experiment(uri: str, experiment: str, folder: Path | None) -> str:
@@ -229,18 +265,13 @@ def one_sentence(error: BaseException) -> str:
 
 def _check_sqlite(path: Path) -> None:
     """Refuse a file that is no SQLite database, or one that belongs to another program."""
-    if not path.exists() or path.stat().st_size == 0:
-        return
     with path.open("r+b"):
         pass
     try:
-        connection = sqlite3.connect(path, timeout=20.0)
-        try:
+        with closing(sqlite3.connect(path, timeout=20.0)) as connection:
             tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type='table'")}
             if "experiments" in tables:
                 connection.execute("SELECT count(*) FROM experiments").fetchone()
-        finally:
-            connection.close()
     except sqlite3.DatabaseError as error:
         raise ConfigError(
             f"tracker.uri=sqlite:///{path} is damaged or no SQLite database ({error}): "
