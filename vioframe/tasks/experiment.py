@@ -26,6 +26,7 @@ from vioframe.sweep import write_status
 from vioframe.tasks.progress import frame_progress
 from vioframe.tasks.run_sequence import Recorder, run_sequence
 from vioframe.tracking import Tracker, metrics_of
+from vioframe.viewer import Viewer, build_viewer
 
 log = logging.getLogger(__name__)
 
@@ -45,13 +46,15 @@ def run(config: DictConfig) -> int:
     pipeline = build_pipeline(config, choices)
     dataset = build(config, "dataset", Dataset, choices.get("dataset", ""))
     tracker = build(config, "tracker", Tracker, choices.get("tracker", ""))
+    viewer = build_viewer(config, choices)
     resolved = OmegaConf.to_yaml(config, resolve=True)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.yaml").write_text(resolved, encoding="utf-8")
     tags = {slot: choices.get(slot, "none") for slot in (*pipeline.parts(), "dataset", "system")}
     plain = OmegaConf.to_container(config, resolve=True)
-    tracker.start(dict(plain) if isinstance(plain, dict) else {}, tags, name=_run_name(pipeline, choices))
-    experiment = _Experiment(config, folder, options, pipeline, dataset, tracker, choices)
+    parameters = {str(key): value for key, value in plain.items()} if isinstance(plain, dict) else {}
+    tracker.start(parameters, tags, name=_run_name(pipeline, choices))
+    experiment = _Experiment(config, folder, options, pipeline, dataset, tracker, viewer, choices)
     with _terminate_like_interrupt(), tracker:
         status = experiment.run(progress=bool(config.progress) and hydra_config.mode != RunMode.MULTIRUN)
         if status == INTERRUPTED:
@@ -82,6 +85,7 @@ class _Experiment:
         pipeline: Pipeline,
         dataset: Dataset,
         tracker: Tracker,
+        viewer: Viewer | None,
         choices: dict[str, str],
     ) -> None:
         self.config = config
@@ -90,6 +94,7 @@ class _Experiment:
         self.pipeline = pipeline
         self.dataset = dataset
         self.tracker = tracker
+        self.viewer = viewer
         self.choices = choices
         self.runs: list[SequenceRun] = []
         self.rows: list[dict[str, object]] = []
@@ -129,6 +134,7 @@ class _Experiment:
                     init=str(self.config.init),
                     sample_count=int(self.config.report_frames),
                     progress=advance,
+                    viewer=self.viewer,
                 )
             except VioframeError as error:
                 # Refused before the first packet: no camera, no ground truth to start from.
@@ -177,7 +183,8 @@ class _Experiment:
             self.tracker.log_file(path, path.parent.relative_to(self.folder).as_posix().removeprefix("."))
         if (self.folder / "plots").is_dir():
             self.tracker.log_folder(self.folder / "plots", "plots")
-        print_rows(self.rows, self.folder, hint=self.tracker.hint)
+        hints = [self.tracker.hint, "" if self.viewer is None else self.viewer.hint]
+        print_rows(self.rows, self.folder, hint="\n".join(hint for hint in hints if hint))
 
 
 def _unopened(name: str, error: str) -> SequenceRun:

@@ -18,6 +18,7 @@ from vioframe.pipeline import InitialState, Pipeline
 from vioframe.state_log import StateLog
 from vioframe.trajectory_io import tum_lines
 from vioframe.types import Measurement, NavState, Packet, Trajectory
+from vioframe.viewer import Viewer
 
 log = logging.getLogger(__name__)
 
@@ -104,6 +105,7 @@ def run_sequence(
     init: str,
     sample_count: int,
     progress: Progress,
+    viewer: Viewer | None = None,
 ) -> tuple[SequenceRun, Recorder, BaseException | None]:
     """Run one recording to its end, to an error, or to Ctrl-C; in each case what there is comes back.
 
@@ -114,6 +116,7 @@ def run_sequence(
         init: ``rest`` or ``groundtruth``.
         sample_count: frames to keep for the report.
         progress: called with the number of windows done.
+        viewer: shows the run while it lasts.
 
     Returns:
         the record, the recorder that watched, and what stopped the run early, or None.
@@ -125,7 +128,12 @@ def run_sequence(
     pipeline.setup(recording.rig, initial_state(init, truth, recording.name))
     users = lend_ground_truth(pipeline, truth, recording.name)
     recorder = Recorder(folder, recording.name, wanted, progress)
-    pipeline.observe(recorder.watch)
+    observers = [recorder.watch]
+    if viewer is not None:
+        viewer.setup(recording.name, recording.rig, truth, folder)
+        observers.append(viewer.watch)
+    for observer in observers:
+        pipeline.observe(observer)
     stop: BaseException | None = None
     packets = prefetch(recording.packets())
     try:
@@ -134,8 +142,11 @@ def run_sequence(
         stop = error
     finally:
         packets.close()
-        pipeline.forget(recorder.watch)
+        for observer in observers:
+            pipeline.forget(observer)
         recorder.close()
+        if viewer is not None:
+            viewer.close()
     counters = dict(recording.counters())
     for part in pipeline.parts().values():
         counters.update(part.counters())
