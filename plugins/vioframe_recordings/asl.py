@@ -145,14 +145,17 @@ class AslDataset(Dataset):
         findings.append(screening.check_frame_steps(stamps_ns))
         if truth is not None:
             findings.append(screening.check_truth_of_frames(stamps_ns + self.camera_delay_ns, truth))
-        rig_cameras = cameras[: self.camera_count] if self.images else ()
+        rig_cameras = cameras[: self.camera_count]
         if self.images:
             self._check_images(folder, paths, rig_cameras, findings)
         return StoredRecording(
             name=sequence,
-            cameras=cameras,
             rig=SensorRig(
-                cameras=rig_cameras, imu=noise, gravity=self.gravity, camera_delay_ns=self.camera_delay_ns
+                cameras=rig_cameras,
+                imu=noise,
+                gravity=self.gravity,
+                camera_delay_ns=self.camera_delay_ns,
+                has_images=self.images,
             ),
             imu=trim(imu, stamps_ns + self.camera_delay_ns),
             frame_stamps_ns=stamps_ns,

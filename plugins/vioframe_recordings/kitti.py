@@ -124,7 +124,7 @@ class KittiDataset(Dataset):
         findings.append(screening.check_frame_steps(frame_stamps_ns))
         if truth is not None:
             findings.append(screening.check_truth_of_frames(frame_stamps_ns + self.camera_delay_ns, truth))
-        rig_cameras = cameras[: self.camera_count] if self.images else ()
+        rig_cameras = cameras[: self.camera_count]
         if self.images:
             check_first_images(paths, rig_cameras, f"recording day {drive.date}", color=self.color)
         gyro_noise, gyro_walk, accel_noise, accel_walk = self.densities
@@ -137,9 +137,12 @@ class KittiDataset(Dataset):
         )
         return StoredRecording(
             name=sequence,
-            cameras=cameras,
             rig=SensorRig(
-                cameras=rig_cameras, imu=noise, gravity=self.gravity, camera_delay_ns=self.camera_delay_ns
+                cameras=rig_cameras,
+                imu=noise,
+                gravity=self.gravity,
+                camera_delay_ns=self.camera_delay_ns,
+                has_images=self.images,
             ),
             imu=trim(imu, frame_stamps_ns + self.camera_delay_ns),
             frame_stamps_ns=frame_stamps_ns,

@@ -156,7 +156,7 @@ class KittiRawDataset(Dataset):
         findings.append(screening.check_frame_steps(stamps_ns))
         findings.append(screening.check_truth_of_frames(stamps_ns + self.camera_delay_ns, truth))
         cameras = self._cameras(name, findings)
-        rig_cameras = cameras[: self.camera_count] if self.images else ()
+        rig_cameras = cameras[: self.camera_count]
         if self.images:
             calibration = str(self.root / name[:10] / "calib_cam_to_cam.txt")
             check_first_images(paths, rig_cameras, calibration, color=self.color)
@@ -171,9 +171,12 @@ class KittiRawDataset(Dataset):
         )
         return StoredRecording(
             name=sequence,
-            cameras=cameras,
             rig=SensorRig(
-                cameras=rig_cameras, imu=noise, gravity=self.gravity, camera_delay_ns=self.camera_delay_ns
+                cameras=rig_cameras,
+                imu=noise,
+                gravity=self.gravity,
+                camera_delay_ns=self.camera_delay_ns,
+                has_images=self.images,
             ),
             imu=trim(imu, stamps_ns + self.camera_delay_ns),
             frame_stamps_ns=stamps_ns,

@@ -1,12 +1,14 @@
 """Checks of what was recorded: units, axes, clocks. What would spoil every result raises; the rest is reported."""
 
+from itertools import permutations, product
+
 import numpy as np
 from vioframe.checks import Array, Stamps
-from vioframe.conventions import seconds
+from vioframe.conventions import GRAVITY, seconds
 from vioframe.data.recording import Finding
 from vioframe.errors import ClockError, DataError
 from vioframe.geometry import so3
-from vioframe.geometry.interpolation import interpolate_poses
+from vioframe.geometry.interpolation import differentiate_positions, interpolate_poses
 from vioframe.types import ImuBlock, Trajectory
 
 # 2000 °/s is the widest range of the inertial sensors in use; 2000 °/s = 34.9 rad/s.
@@ -17,6 +19,10 @@ LARGEST_QUIET_RATE = 1.0
 # The mean of |specific force| is g within a few percent in the recordings known to us (9.79 to 10.04 m/s²);
 # the margin leaves room for aggressive flight, not for another unit (1 g) or for gravity taken out (near 0).
 ACCEL_RANGE = (7.0, 14.0)
+# Another order or sign of the axes must fit twice as well as the one in the file to call the file wrong; in the
+# recordings known to us the file's own fits best, by a factor of 1.01 to 26. Fewer intervals prove nothing.
+AXES_EVIDENCE, FEWEST_INTERVALS = 2.0, 20
+
 # Mean specific force in the world against the vertical: up to 2.8° in the recordings known to us.
 TILT_NOTE_DEG, TILT_BAD_DEG = 1.5, 20.0
 
@@ -183,6 +189,7 @@ def check_with_truth(imu: ImuBlock, truth: Trajectory, where: str, *, vertical: 
         text = f"{holes} drop-outs, the longest {longest:.2f} s; they are kept as they are"
         findings.append(Finding(level="note", subject="ground truth gaps", text=text))
     findings += _check_rotation(imu, truth, where)
+    findings += _check_force(imu, truth, where)
     if vertical:
         findings += _check_vertical(imu, truth, where)
     return findings
@@ -233,6 +240,12 @@ def _check_rotation(imu: ImuBlock, truth: Trajectory, where: str) -> list[Findin
             f"{where}: the gyro is {scale:.1f} times the rotation rate of the ground truth, as degrees are of radians "
             "(57.3): convert it to rad/s"
         )
+    axes = better_axes(measured, true)
+    if axes:
+        raise DataError(
+            f"{where}: the gyro agrees with the rotation of the ground truth only when its axes are taken as {axes}: "
+            "they are swapped, or the ground truth is that of another frame; put them right"
+        )
     # Axes about which the body hardly turns show the noise of the truth, not agreement.
     axis = int(np.argmax(true.std(axis=0)))
     values = correlations(measured, true)
@@ -241,6 +254,63 @@ def _check_rotation(imu: ImuBlock, truth: Trajectory, where: str) -> list[Findin
         text += ": axes, clock or unit of the two disagree; check the calibration and the ground-truth file"
         return [Finding(level="bad", subject="gyro and ground truth", text=text)]
     return [Finding(level="good", subject="gyro and ground truth", text=text)]
+
+
+def better_axes(measured: Array, expected: Array) -> str:
+    """The order and signs of axes with which (M, 3) clearly fits better than as it is, or an empty text."""
+    if len(measured) < FEWEST_INTERVALS:
+        return ""
+    misfits = {
+        (order, signs): float(np.sqrt(((measured[:, list(order)] * signs - expected) ** 2).sum(axis=1).mean()))
+        for order in permutations(range(3))
+        for signs in product((1, -1), repeat=3)
+    }
+    order, signs = min(misfits, key=lambda choice: misfits[choice])
+    if misfits[(0, 1, 2), (1, 1, 1)] < AXES_EVIDENCE * misfits[order, signs]:
+        return ""
+    names = [("" if sign > 0 else "−") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True)]
+    return f"({', '.join(names)})"
+
+
+def specific_forces(imu: ImuBlock, truth: Trajectory, interval_s: float = 0.5) -> tuple[Array, Array]:
+    """Mean specific force (M, 3) m/s² in the body, measured and that of the true motion, over the same intervals.
+
+    The true one is ``Rᵀ (dv/dt + g)``. Intervals that either of the two does not fill are left out.
+    """
+    velocity = differentiate_positions(truth)
+    elapsed = (truth.stamps_ns - truth.stamps_ns[0]) / 1e9
+    upward = np.gradient(velocity, elapsed, axis=0) + np.array([0.0, 0.0, GRAVITY])
+    true = (np.swapaxes(truth.T_world_body[:, :3, :3], -1, -2) @ upward[..., None])[..., 0]
+    start = max(int(truth.stamps_ns[0]), int(imu.stamps_ns[0]))
+    end = min(int(truth.stamps_ns[-1]), int(imu.stamps_ns[-1]))
+    interval_ns = int(interval_s * 1e9)
+    count = (end - start) // interval_ns
+    if count < 1:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    means, filled = [], np.ones(count, dtype=bool)
+    for stamps_ns, values in ((imu.stamps_ns, imu.accel), (truth.stamps_ns, true)):
+        which = (stamps_ns - start) // interval_ns
+        inside = (which >= 0) & (which < count)
+        samples = np.bincount(which[inside], minlength=count)
+        sums = [np.bincount(which[inside], weights=values[inside, axis], minlength=count) for axis in range(3)]
+        means.append(np.stack(sums, axis=1) / np.maximum(samples, 1)[:, None])
+        filled &= samples > 0.8 * np.median(samples)
+    return means[0][filled], means[1][filled]
+
+
+def _check_force(imu: ImuBlock, truth: Trajectory, where: str) -> list[Finding]:
+    measured, true = specific_forces(imu, truth)
+    if len(measured) < FEWEST_INTERVALS:
+        return []
+    axes = better_axes(measured, true)
+    if axes:
+        raise DataError(
+            f"{where}: the accelerometer agrees with the motion of the ground truth only when its axes are taken as "
+            f"{axes}: they are swapped or turned; put them right"
+        )
+    misfit = float(np.sqrt(((measured - true) ** 2).sum(axis=1).mean()))
+    text = f"within {misfit:.2f} m/s² of the true motion over intervals of 0.5 s (bias and errors of attitude)"
+    return [Finding(level="good" if misfit < 1.0 else "note", subject="accelerometer and ground truth", text=text)]
 
 
 def mean_specific_force(imu: ImuBlock, truth: Trajectory) -> tuple[Array, int]:

@@ -45,7 +45,6 @@ class StoredRecording(Recording):
         self,
         *,
         name: str,
-        cameras: tuple[Camera, ...],
         rig: SensorRig,
         imu: ImuBlock,
         frame_stamps_ns: Stamps,
@@ -56,7 +55,6 @@ class StoredRecording(Recording):
         missing_images: int = 0,
     ) -> None:
         self.name = name
-        self.cameras = cameras
         self.imu = imu
         self.frame_stamps_ns = frame_stamps_ns
         self._rig = rig

@@ -195,3 +195,35 @@ def test_kitti_raw_excerpt_is_refused_unless_derived() -> None:
     assert drive is not None
     np.testing.assert_allclose(recording.cameras[0].T_body_cam, drive.T_body_cam0, atol=1e-6)
     assert recording.cameras[0].size_px == drive.size_px
+
+
+def turned(imu: ImuBlock, *, gyro: list[int] | None = None, accel: list[int] | None = None) -> ImuBlock:
+    """The samples with axes in another order; −1 turns an axis over, counted from 1."""
+
+    def pick(values: Array, order: list[int] | None) -> Array:
+        if order is None:
+            return values
+        return np.stack([np.sign(axis) * values[:, abs(axis) - 1] for axis in order], axis=1)
+
+    return ImuBlock(stamps_ns=imu.stamps_ns, gyro=pick(imu.gyro, gyro), accel=pick(imu.accel, accel))
+
+
+@pytest.mark.parametrize(
+    ("accel", "said"), [([2, 1, 3], r"\(y, x, z\)"), ([2, 3, 1], r"\(z, x, y\)"), ([1, 2, -3], r"\(x, y, −z\)")]
+)
+@pytest.mark.parametrize("source", ["euroc", "tumvi", "kitti"])
+def test_wrong_axes_are_found_and_named(source: str, accel: list[int], said: str) -> None:
+    if source == "euroc":
+        root = str(shared_data("euroc_imu_gt", "V1_02_medium").parent)
+        recording = EurocDataset(root=root, sequence="V1_02_medium", images=False).open("V1_02_medium")
+    elif source == "tumvi":
+        root = str(shared_data("tumvi", "dataset-room2_512_16").parent)
+        recording = TumviDataset(root=root, images=False).open("dataset-room2_512_16")
+    else:
+        recording = KittiDataset(root=str(kitti_root()), sequence="07", images=False).open("07")
+    truth = truth_of(recording)
+    screening.check_with_truth(recording.imu, truth, "imu")
+    with pytest.raises(DataError, match=f"accelerometer agrees .* only when its axes are taken as {said}"):
+        screening.check_with_truth(turned(recording.imu, accel=accel), truth, "imu")
+    with pytest.raises(DataError, match=f"gyro agrees .* only when its axes are taken as {said}"):
+        screening.check_with_truth(turned(recording.imu, gyro=accel), truth, "imu")
