@@ -127,8 +127,7 @@ class BagDataset(Dataset):
         kept, covered_findings = self._frames(bag, topics, contents, imu, delay_ns)
         findings += covered_findings
         stamps_ns = [
-            np.array(stamps, dtype=np.int64)[rows]
-            for stamps, rows in zip(contents.frame_stamps_ns, kept, strict=True)
+            np.array(stamps, dtype=np.int64)[rows] for stamps, rows in zip(contents.frame_stamps_ns, kept, strict=True)
         ]
         before = [np.array(counts)[rows] for counts, rows in zip(contents.imu_before, kept, strict=True)]
         start, end = _span(imu, stamps_ns[0] + delay_ns)
@@ -250,9 +249,7 @@ class BagDataset(Dataset):
             problem = None
             for attempt, message in enumerate(bag.read([topic])):
                 try:
-                    image = image_of(
-                        message.decode(), message.kind, color=self._color, mono16_bits=self._mono16_bits
-                    )
+                    image = image_of(message.decode(), message.kind, color=self._color, mono16_bits=self._mono16_bits)
                     check_size(image, camera)
                 except DataError as error:
                     problem = error
@@ -345,9 +342,7 @@ def find_bags(root: Path) -> dict[str, Path]:
             f"{root}: no bag here (dataset.root): a .bag, .mcap or .db3 file or a folder with metadata.yaml is expected"
         )
     stems = [path.stem if path.is_file() else path.name for path in candidates]
-    return {
-        stem if stems.count(stem) == 1 else path.name: path for stem, path in zip(stems, candidates, strict=True)
-    }
+    return {stem if stems.count(stem) == 1 else path.name: path for stem, path in zip(stems, candidates, strict=True)}
 
 
 def _is_bag(path: Path) -> bool:

@@ -222,9 +222,7 @@ def truth_to_estimate(truth: Trajectory, state: NavState) -> Array | None:
     Both worlds have z up, so that it is a heading and a position: the rotation about z that is nearest to
     ``R_estimate R_truthᵀ``.
     """
-    poses, covered = interpolate_poses(
-        truth, np.array([state.stamp_ns], dtype=np.int64), max_gap_ns=_MAX_TRUTH_GAP_NS
-    )
+    poses, covered = interpolate_poses(truth, np.array([state.stamp_ns], dtype=np.int64), max_gap_ns=_MAX_TRUTH_GAP_NS)
     if not covered[0]:
         return None
     R = state.T_world_body[:3, :3] @ poses[0, :3, :3].T

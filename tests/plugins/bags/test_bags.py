@@ -119,9 +119,7 @@ class BagWriter:
             fields = {"pose": pose}
         elif kind.endswith("TransformStamped"):
             turned = self.rotation(T[:3, :3])
-            transform = self.make(
-                "geometry_msgs/msg/Transform", translation=self.vector(T[:3, 3]), rotation=turned
-            )
+            transform = self.make("geometry_msgs/msg/Transform", translation=self.vector(T[:3, 3]), rotation=turned)
             fields = {"child_frame_id": "imu", "transform": transform}
         else:
             zero = self.vector(np.zeros(3))
@@ -296,9 +294,7 @@ def test_span_and_every(tmp_path, simulated, options):
 
 def test_blind_streams_stamps_only_and_needs_no_camera_calibration(tmp_path, simulated, options):
     path = write_bag(tmp_path / "walk", "ros1", simulated)
-    recording = open_bag(
-        path, imu_calibration=options["imu_calibration"], camera_topics=CAMERAS[0], images=False
-    )
+    recording = open_bag(path, imu_calibration=options["imu_calibration"], camera_topics=CAMERAS[0], images=False)
     frames = [p for p in recording.packets() if isinstance(p, Frame)]
     assert len(frames) == recording.frame_count and not any(f.images for f in frames)
     assert not recording.rig.has_images
@@ -328,9 +324,7 @@ def test_corrupt_image_is_left_out_and_counted(tmp_path, simulated, options, cam
         writer.image(CAMERAS[0], frame.stamp_ns, frame.images[0], data=frame.images[0].reshape(-1)[:100])
         writer.image(CAMERAS[1], frame.stamp_ns, frame.images[1])
 
-    path = write_bag(
-        tmp_path / "walk", "mcap", simulated, spoil=spoil_frame(4, truncated if cameras == 2 else broken)
-    )
+    path = write_bag(tmp_path / "walk", "mcap", simulated, spoil=spoil_frame(4, truncated if cameras == 2 else broken))
     recording = open_bag(path, cameras=cameras, **options)
     frames = [p for p in recording.packets() if isinstance(p, Frame)]
     expected = [p for p in simulated.packets if isinstance(p, Frame)]

@@ -241,7 +241,8 @@ def test_colours_stay_with_their_ids():
 
 
 @pytest.mark.parametrize(
-    "address", ["127.0.0.1:9876", "http://127.0.0.1:9876/proxy", "rerun+http://127.0.0.1/proxy", "rerun+http://h:x/proxy"]
+    "address",
+    ["127.0.0.1:9876", "http://127.0.0.1:9876/proxy", "rerun+http://127.0.0.1/proxy", "rerun+http://h:x/proxy"],
 )
 def test_addresses_that_are_none(address):
     with pytest.raises(ConfigError, match="is not like"):
