@@ -5,11 +5,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
+import numpy as np
 from vioframe.conventions import NANOSECONDS, seconds
 from vioframe.error_state import InertialFilter, add_gap, coasting
-from vioframe.errors import StateError
+from vioframe.errors import ConfigError, StateError
 from vioframe.interfaces import INERTIAL_DELTA, Fuser
-from vioframe.loose_fusion import InertialOptions, StandstillOptions, StartOptions
+from vioframe.loose_fusion import StandstillOptions, StartOptions
 from vioframe.types import ImuBias, InertialDelta, Measurement, NavState, SensorRig
 
 
@@ -17,10 +18,18 @@ class ImuOnlyFuser(Fuser):
     """Integrates inertial increments from a known start, with the covariance that this implies.
 
     Args:
-        inertial: trust in the inertial increments.
+        gyro_noise_scale: factor on the gyro's white noise density of the rig.
+        accel_noise_scale: factor on the accelerometer's.
+        walk_scale: factor on the bias walk densities of the rig.
+        gap_allowed_s: a longer hole between samples widens the covariance, s.
+        gap_rate_sigma: rad/s, unknown rate inside such a hole.
+        gap_accel_sigma: m/s², unknown acceleration inside such a hole.
         standstill: zero-velocity updates; off unless enabled, since a car that coasts on a smooth straight
             road reads as one that stands.
         start: what is assumed of the first state.
+
+    Raises:
+        ConfigError: an option outside its range.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({INERTIAL_DELTA})
@@ -28,19 +37,41 @@ class ImuOnlyFuser(Fuser):
     def __init__(
         self,
         *,
-        inertial: InertialOptions | None = None,
+        gyro_noise_scale: float = 1.0,
+        accel_noise_scale: float = 1.0,
+        walk_scale: float = 1.0,
+        gap_allowed_s: float = 0.05,
+        gap_rate_sigma: float = 0.5,
+        gap_accel_sigma: float = 2.0,
         standstill: StandstillOptions | None = None,
         start: StartOptions | None = None,
     ) -> None:
-        self._inertial = inertial or InertialOptions()
+        for name, value in (
+            ("gyro_noise_scale", gyro_noise_scale),
+            ("accel_noise_scale", accel_noise_scale),
+            ("gap_allowed_s", gap_allowed_s),
+        ):
+            if not value > 0.0:
+                raise ConfigError(f"fuser.{name} must be positive, got {value}")
+        for name, value in (
+            ("walk_scale", walk_scale),
+            ("gap_rate_sigma", gap_rate_sigma),
+            ("gap_accel_sigma", gap_accel_sigma),
+        ):
+            if not value >= 0.0:
+                raise ConfigError(f"fuser.{name} must not be negative, got {value}")
+        # Noise of v and p is the accelerometer's, near enough, in a window.
+        self._noise_scale = np.repeat([gyro_noise_scale, accel_noise_scale, accel_noise_scale], 3)
+        self._walk_scale = walk_scale
+        self._gap_sigmas = (gap_rate_sigma, gap_accel_sigma)
+        self._gap_allowed_ns = round(gap_allowed_s * NANOSECONDS)
         self._standstill = standstill or StandstillOptions(enabled=False)
         self._start = start or StartOptions()
-        self._gap_allowed_ns = round(self._inertial.gap_allowed_s * NANOSECONDS)
         self._filter: InertialFilter | None = None
 
     def setup(self, rig: SensorRig) -> None:
         """Forget the last sequence; take noise densities and gravity of the next."""
-        walk = self._inertial.walk_scale
+        walk = self._walk_scale
         noise = replace(rig.imu, gyro_walk=rig.imu.gyro_walk * walk, accel_walk=rig.imu.accel_walk * walk)
         self._filter = InertialFilter(extra=0, noise=noise, gravity=rig.gravity)
         self._rest = self._start.at_rest(rig)
@@ -91,18 +122,17 @@ class ImuOnlyFuser(Fuser):
         return filter_.nav_state(stamp_ns, "tracking")
 
     def _unseen(self, filter_: InertialFilter, duration_s: float) -> InertialDelta:
-        options = self._inertial
-        return coasting(
-            filter_.body, duration_s, filter_.gravity, options.gap_rate_sigma, options.gap_accel_sigma
-        )
+        return coasting(filter_.body, duration_s, filter_.gravity, *self._gap_sigmas)
 
     def _move(self, filter_: InertialFilter, measurement: Measurement, delta: InertialDelta) -> None:
-        options = self._inertial
-        delta = options.scaled(delta)
+        if (self._noise_scale != 1.0).any():
+            # Integrating again would give the unscaled covariance back.
+            covariance = self._noise_scale[:, None] * delta.covariance * self._noise_scale
+            delta = replace(delta, covariance=covariance, reintegrate=None)
         window = measurement.window
         if window.gap_ns > self._gap_allowed_ns:
             self._counts["windows with inertial gaps"] += 1
-            delta = add_gap(delta, seconds(window.gap_ns), options.gap_rate_sigma, options.gap_accel_sigma)
+            delta = add_gap(delta, seconds(window.gap_ns), *self._gap_sigmas)
         if not (self._standstill.enabled and self._test.push(window, filter_.body)):
             filter_.propagate(delta)
             return

@@ -1,11 +1,13 @@
 """Dead reckoning against the analytic motion, its covariance against many runs, and KITTI's real sensor."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from vioframe.conventions import NANOSECONDS
-from vioframe.errors import StateError
+from vioframe.errors import ConfigError, StateError
 from vioframe.geometry import so3
-from vioframe.loose_fusion import InertialOptions, StandstillOptions
+from vioframe.loose_fusion import StandstillOptions
 from vioframe.testing import check_component
 from vioframe.types import ImuBias, ImuBlock, ImuNoise, Measurement, NavState, SensorRig, SyncedWindow
 
@@ -34,6 +36,38 @@ def navigate(fuser: ImuOnlyFuser, windows: list[SyncedWindow], rig: SensorRig) -
 
 def test_keeps_the_contract() -> None:
     check_component(ImuOnlyFuser())
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"gyro_noise_scale": 0.0},
+        {"accel_noise_scale": -1.0},
+        {"gap_allowed_s": 0.0},
+        {"walk_scale": -1.0},
+        {"gap_rate_sigma": -1.0},
+        {"gap_accel_sigma": -1.0},
+    ],
+)
+def test_wrong_options_are_refused_by_name(option: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=f"fuser.{next(iter(option))}"):
+        ImuOnlyFuser(**option)
+
+
+def test_noise_scales_widen_their_own_part() -> None:
+    windows = windows_of(samples(even_stamps(0.0, 1.0, 200)), 20)
+    rig = make_rig(ImuNoise(gyro_noise=0.02, gyro_walk=0.0, accel_noise=0.5, accel_walk=0.0, rate_hz=200.0))
+    sigmas = []
+    for option in ({}, {"gyro_noise_scale": 3.0}, {"accel_noise_scale": 3.0}):
+        fuser = ImuOnlyFuser(**option)
+        fuser.setup(rig)
+        fuser.start_from(replace(state_at(0.0), covariance=1e-10 * np.eye(15)))
+        covariance = navigate(fuser, windows, rig)[-1].covariance
+        assert covariance is not None
+        sigmas.append(np.sqrt(np.diag(covariance)))
+    np.testing.assert_allclose(sigmas[1][:3], 3.0 * sigmas[0][:3], rtol=1e-3)
+    np.testing.assert_allclose(sigmas[2][:3], sigmas[0][:3], rtol=1e-6)
+    assert np.all(sigmas[2][6:9] > 2.5 * sigmas[0][6:9])
 
 
 def test_calls_out_of_order_are_refused() -> None:
@@ -169,7 +203,7 @@ def test_a_hole_widens_the_covariance_and_is_counted() -> None:
 def test_a_window_that_never_came_is_crossed() -> None:
     rig = make_rig()
     windows = windows_of(samples(even_stamps(0.0, 1.0, 200)), 20)
-    fuser = ImuOnlyFuser(inertial=InertialOptions(gap_accel_sigma=5.0))
+    fuser = ImuOnlyFuser(gap_accel_sigma=5.0)
     fuser.setup(rig)
     fuser.start_from(state_at(0.0))
     states = navigate(fuser, windows[:4] + windows[5:], rig)
