@@ -38,6 +38,7 @@ def run_job(config: "DictConfig") -> None:
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
+    reason = ""
     in_sweep = HydraConfig.get().mode == RunMode.MULTIRUN
     try:
         status = dispatch(config)
@@ -46,14 +47,15 @@ def run_job(config: "DictConfig") -> None:
             raise
         log.error("%s", error)
         status = 1
-        if in_sweep:
-            from vioframe.sweep import write_status
-
-            write_status(Path(HydraConfig.get().runtime.output_dir), "failed", str(error))
+        reason = str(error)
     if status == INTERRUPTED and in_sweep:
         raise KeyboardInterrupt
-    # In a sweep the other jobs go on; conclude() reads what became of each from its folder.
-    if status and not in_sweep:
+    if in_sweep:
+        # The other jobs go on; conclude() reads what became of each from its folder.
+        from vioframe.sweep import write_status
+
+        write_status(Path(HydraConfig.get().runtime.output_dir), "failed" if status else "finished", reason)
+    elif status:
         sys.exit(status)
 
 

@@ -25,13 +25,10 @@ class StoredRecording(Recording):
 
     Attributes:
         name: of the sequence.
-        cameras: calibration of all cameras, whether or not their images are read; what a simulator that
-            replays the recording renders with.
 
     Args:
         name: of the sequence.
-        cameras: calibration of all cameras of the recording.
-        rig: calibration of what is streamed: no cameras where images are not read.
+        rig: calibration, also of cameras whose images are not read (``has_images``).
         imu: all samples, IMU clock.
         frame_stamps_ns: (F,) increasing, camera clock.
         image_paths: for each streamed camera the F files; empty streams stamps only.
@@ -67,7 +64,7 @@ class StoredRecording(Recording):
 
     @property
     def rig(self) -> SensorRig:
-        """Calibration; no cameras where images are not read."""
+        """Calibration."""
         return self._rig
 
     @property
@@ -118,7 +115,8 @@ class StoredRecording(Recording):
 
     def _frame(self, index: int) -> Frame | None:
         images = []
-        for paths, camera in zip(self._image_paths, self.rig.cameras, strict=True):
+        # Stamps alone have no paths, though their cameras are known.
+        for paths, camera in zip(self._image_paths, self.rig.cameras, strict=self.rig.has_images):
             image = read_image(paths[index], color=self._color)
             wrong = "cannot be decoded" if image is None else size_mismatch(image, camera)
             if image is None or wrong:

@@ -53,9 +53,9 @@ def run(config: DictConfig) -> int:
     tags = {slot: choices.get(slot, "none") for slot in (*pipeline.parts(), "dataset", "system")}
     plain = OmegaConf.to_container(config, resolve=True)
     parameters = {str(key): value for key, value in plain.items()} if isinstance(plain, dict) else {}
-    tracker.start(parameters, tags, name=_run_name(pipeline, choices))
     experiment = _Experiment(config, folder, options, pipeline, dataset, tracker, viewer, choices)
     with _terminate_like_interrupt(), tracker:
+        tracker.start(parameters, tags, name=_run_name(pipeline, choices))
         status = experiment.run(progress=bool(config.progress) and hydra_config.mode != RunMode.MULTIRUN)
         if status == INTERRUPTED:
             tracker.finish("killed", "interrupted by the user")

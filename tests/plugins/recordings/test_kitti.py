@@ -217,7 +217,7 @@ def test_raw_drive_goes_north(make_raw_drive: Maker) -> None:
 
 
 def test_raw_calibration_chains(make_raw_drive: Maker) -> None:
-    rectified = raw(make_raw_drive(), images=False).open("2011_09_26_drive_0042_sync").cameras
+    rectified = raw(make_raw_drive(), images=False, cameras=2).open("2011_09_26_drive_0042_sync").rig.cameras
     np.testing.assert_allclose(rectified[0].intrinsics_px, [60, 60, 32, 24])
     # imu → velo → cam: p_cam = R (p_imu + (-0.8, 0.3, -0.8)) + (0, -0.07, -0.27), R = rows (0,-1,0), (0,0,-1), (1,0,0)
     np.testing.assert_allclose(rectified[0].T_body_cam[:3, 3], [1.07, -0.3, 0.73], atol=1e-12)

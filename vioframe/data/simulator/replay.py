@@ -119,12 +119,11 @@ class ReplayDataset(Dataset):
         truth = recording.ground_truth()
         if truth is None:
             raise DataError(f"{sequence}: a replay needs ground truth, and this recording has none")
-        # A recording read without its images streams no camera, but still knows them.
-        cameras = tuple(getattr(recording, "cameras", ())) or recording.rig.cameras
+        cameras = recording.rig.cameras
         if len(cameras) < self._cameras:
             raise DataError(
                 f"{sequence}: a replay with {self._cameras} camera(s) needs their calibration, and the source has "
-                f"that of {len(cameras)}: set dataset.cameras"
+                f"that of {len(cameras)}: set dataset.source.cameras"
             )
         covered = longest_covered(truth, self._max_gap_s)
         begin_ns = int(covered.stamps_ns[0]) + round(self._start_s * NANOSECONDS)
