@@ -20,9 +20,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+
 from vioframe.geometry import so3
 from vioframe.types import ImuBias
-
 from vioframe_preintegration import Preintegration, Strapdown
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))

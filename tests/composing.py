@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
+
 from vioframe.plugins import core_conf, discover, extend_hydra
 
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+
 from vioframe.conventions import NANOSECONDS, gravity_vector
 from vioframe.geometry import se3, so3
 from vioframe.types import Frame, ImuBlock, ImuNoise, SensorRig, SyncedWindow

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+
 from vioframe.evaluation.run import SampleFrame, SequenceRun
 from vioframe.geometry import se3, so3
 from vioframe.types import ImuBias, NavState, Trajectory

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from vioframe.checks import Array, check_pose
 from vioframe.conventions import NANOSECONDS
 from vioframe.errors import DataError, ShapeError

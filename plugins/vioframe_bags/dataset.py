@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+
 from vioframe.checks import Array, Stamps, check_pose
 from vioframe.conventions import GRAVITY, NANOSECONDS
 from vioframe.data.recording import Dataset, Finding
 from vioframe.errors import ClockError, ConfigError, DataError, ShapeError
 from vioframe.geometry import se3
 from vioframe.types import ImuBlock, SensorRig, Trajectory
-
 from vioframe_bags import screening
 from vioframe_bags.bag import IMAGE, IMU, POSE, Bag
 from vioframe_bags.calibration import CalibratedCamera, CalibratedImu, read_cameras, read_imu

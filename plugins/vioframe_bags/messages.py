@@ -4,11 +4,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+
 from vioframe.checks import Array
 from vioframe.errors import DataError
 from vioframe.geometry import quaternion, se3
 from vioframe.types import Image
-
 from vioframe_bags.bag import COMPRESSED_IMAGE
 
 _CHANNELS = {"mono8": 1, "8UC1": 1, "mono16": 1, "16UC1": 1, "bgr8": 3, "8UC3": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4}

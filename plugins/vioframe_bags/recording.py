@@ -4,12 +4,12 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+
 from vioframe.checks import Stamps
 from vioframe.conventions import seconds
 from vioframe.data.recording import Finding, Recording
 from vioframe.errors import DataError
 from vioframe.types import Camera, Frame, Image, ImuBlock, Packet, SensorRig, Trajectory
-
 from vioframe_bags.bag import Bag
 from vioframe_bags.messages import image_of
 

@@ -1,6 +1,7 @@
 """What must hold of a bag before it is run: order of stamps, units, clocks that overlap."""
 
 import numpy as np
+
 from vioframe.checks import Stamps
 from vioframe.conventions import seconds
 from vioframe.data.recording import Finding

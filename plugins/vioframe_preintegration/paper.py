@@ -5,11 +5,11 @@ and Long Short-Term Memory Networks", Chinese Journal of Computers 45(8), 2022.
 """
 
 import numpy as np
+
 from vioframe.conventions import NANOSECONDS
 from vioframe.errors import StateError
 from vioframe.interfaces import InertialIntegrator
 from vioframe.types import ImuBias, ImuBlock, ImuNoise, InertialDelta, InertialPath, SensorRig
-
 from vioframe_preintegration.rotations import cumulative_products, exp_and_right_jacobian
 
 

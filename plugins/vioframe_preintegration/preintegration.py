@@ -23,13 +23,13 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
+
 from vioframe.checks import Array
 from vioframe.conventions import NANOSECONDS
 from vioframe.errors import ConfigError, StateError
 from vioframe.geometry import so3
 from vioframe.interfaces import InertialIntegrator
 from vioframe.types import ImuBias, ImuBlock, ImuNoise, InertialDelta, InertialPath, SensorRig
-
 from vioframe_preintegration.rotations import cumulative_products, exp_and_right_jacobian
 
 Method = Literal["midpoint", "euler"]

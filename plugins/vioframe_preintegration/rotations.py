@@ -1,6 +1,7 @@
 """Products of many small rotations without a loop over them."""
 
 import numpy as np
+
 from vioframe.checks import Array
 from vioframe.geometry import so3
 

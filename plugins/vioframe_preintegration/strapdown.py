@@ -17,6 +17,7 @@ of third order in the step, one more than that of the midpoint rule.
 from functools import partial
 
 import numpy as np
+
 from vioframe.checks import Array
 from vioframe.conventions import NANOSECONDS
 from vioframe.errors import ConfigError, StateError

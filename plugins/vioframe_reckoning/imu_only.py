@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
+
 from vioframe.conventions import NANOSECONDS, seconds
 from vioframe.error_state import InertialFilter, add_gap, coasting
 from vioframe.errors import ConfigError, StateError

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import numpy as np
+
 from vioframe.checks import Array
 from vioframe.conventions import seconds
 from vioframe.errors import ConfigError, StateError

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
+
 from vioframe.checks import Array, Stamps
 from vioframe.conventions import NANOSECONDS
 from vioframe.data.recording import Dataset, Finding
@@ -17,7 +18,6 @@ from vioframe.geometry import se3
 from vioframe.tables import integer_stamps, read_table
 from vioframe.trajectory_io import read_trajectory
 from vioframe.types import Camera, CameraModel, ImuBlock, ImuNoise, SensorRig, Trajectory
-
 from vioframe_recordings import gaps, screening
 from vioframe_recordings.stored import StoredRecording, check_first_images
 

@@ -4,8 +4,8 @@ Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
 """
 
 import numpy as np
-from vioframe.types import Camera, ImuNoise
 
+from vioframe.types import Camera, ImuNoise
 from vioframe_recordings.asl import AslDataset, Profile
 
 # cam0/sensor.yaml, cam1/sensor.yaml and imu0/sensor.yaml of V1_01_easy; the same in all sequences.

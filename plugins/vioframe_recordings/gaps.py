@@ -4,6 +4,7 @@ from itertools import pairwise
 from typing import Literal, get_args
 
 import numpy as np
+
 from vioframe.checks import Stamps
 from vioframe.conventions import seconds
 from vioframe.data.recording import Finding

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+
 from vioframe.checks import Array, Stamps
 from vioframe.conventions import NANOSECONDS, seconds
 from vioframe.data.recording import Dataset, Finding
@@ -17,7 +18,6 @@ from vioframe.errors import ConfigError, DataError
 from vioframe.geometry import se3, so3
 from vioframe.trajectory_io import read_times, read_trajectory
 from vioframe.types import Camera, ImuBlock, ImuNoise, SensorRig, Trajectory
-
 from vioframe_recordings import screening
 from vioframe_recordings.asl import as_list, check_span, find_root, names_in, select_frames, trim
 from vioframe_recordings.kitti_calibration import (

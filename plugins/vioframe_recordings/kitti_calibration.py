@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
 from vioframe.checks import Array, Stamps
 from vioframe.conventions import seconds
 from vioframe.errors import DataError

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
+
 from vioframe.checks import Array, Stamps
 from vioframe.conventions import NANOSECONDS
 from vioframe.data.recording import Dataset, Finding
 from vioframe.errors import ClockError, ConfigError, DataError
 from vioframe.geometry import se3, so3
 from vioframe.types import Camera, ImuBlock, ImuNoise, SensorRig, Trajectory
-
 from vioframe_recordings import gaps, screening
 from vioframe_recordings.asl import (
     as_list,

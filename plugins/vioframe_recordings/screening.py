@@ -3,6 +3,7 @@
 from itertools import permutations, product
 
 import numpy as np
+
 from vioframe.checks import Array, Stamps
 from vioframe.conventions import GRAVITY, seconds
 from vioframe.data.recording import Finding

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+
 from vioframe.checks import Stamps
 from vioframe.conventions import seconds
 from vioframe.data.recording import Finding, Recording

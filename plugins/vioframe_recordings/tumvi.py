@@ -4,9 +4,9 @@ Schubert et al., "The TUM VI benchmark for evaluating visual-inertial odometry",
 """
 
 import numpy as np
+
 from vioframe.geometry import se3
 from vioframe.types import Camera, ImuNoise
-
 from vioframe_recordings.asl import AslDataset, Profile
 
 

@@ -8,6 +8,7 @@ from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
+
 from vioframe.checks import Array, Stamps
 from vioframe.errors import ConfigError, StateError
 from vioframe.geometry import se3, so3

@@ -8,6 +8,7 @@ from dataclasses import replace
 from statistics import median
 
 import numpy as np
+
 from vioframe.conventions import NANOSECONDS, seconds
 from vioframe.errors import ConfigError, StateError
 from vioframe.interfaces import Synchronizer

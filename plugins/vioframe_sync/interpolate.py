@@ -1,9 +1,9 @@
 """Samples at the stamps of the frames by linear interpolation."""
 
 import numpy as np
+
 from vioframe.checks import Array
 from vioframe.types import ImuBlock
-
 from vioframe_sync.buffered import BufferedSynchronizer
 
 

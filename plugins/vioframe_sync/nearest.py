@@ -1,8 +1,8 @@
 """Samples at the stamps of the frames by taking the nearest."""
 
 import numpy as np
-from vioframe.types import ImuBlock
 
+from vioframe.types import ImuBlock
 from vioframe_sync.buffered import BufferedSynchronizer
 
 

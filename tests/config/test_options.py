@@ -4,14 +4,14 @@ import inspect
 
 import pytest
 from omegaconf import OmegaConf
+
+from composing import composed, offered
 from vioframe.build import build, build_pipeline, resolve_class
 from vioframe.data.recording import Dataset
 from vioframe.errors import ConfigError
 from vioframe.evaluation.rows import evaluate_run
 from vioframe.pipeline import SLOTS
 from vioframe.tasks.run_sequence import run_sequence
-
-from composing import composed, offered
 
 PARTS = [(slot, name) for slot in SLOTS for name in offered(slot) if name != "none"]
 

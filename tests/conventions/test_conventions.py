@@ -8,6 +8,8 @@ import dataclasses
 
 import numpy as np
 import pytest
+
+from inertial_truth import NOISE, QUIET, even_stamps, exact_increment, make_rig, motion, samples, window_of
 from vioframe.conventions import GRAVITY, NANOSECONDS, STATE_ORDER, gravity_vector, seconds
 from vioframe.errors import ShapeError
 from vioframe.geometry import camera as camera_model
@@ -27,8 +29,6 @@ from vioframe.types import (
     SyncedWindow,
     Trajectory,
 )
-
-from inertial_truth import NOISE, QUIET, even_stamps, exact_increment, make_rig, motion, samples, window_of
 
 CAMERA = Camera(
     model="pinhole", intrinsics_px=np.array([100.0, 100.0, 32.0, 24.0]), size_px=(65, 49), T_body_cam=np.eye(4)

@@ -4,6 +4,7 @@ import os
 
 import pytest
 from omegaconf import OmegaConf
+
 from vioframe.build import build, build_pipeline, resolve_class
 from vioframe.errors import ConfigError, TargetError
 from vioframe.interfaces import Fuser

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import pytest
+
 from vioframe.data.recording import Dataset, Finding, Recording
 from vioframe.errors import DataError
 from vioframe.tasks.doctor import diagnose, format_findings, has_bad
@@ -84,7 +85,7 @@ def test_a_broken_sequence_is_a_bad_finding_and_the_others_go_on() -> None:
 
 
 def test_it_reads_the_recording_through() -> None:
-    (_, findings), = diagnose(Hospital({"ward": Ward([10, 20, 30])}))
+    ((_, findings),) = diagnose(Hospital({"ward": Ward([10, 20, 30])}))
     assert ("reading", "3 of 3 frames and 6 IMU samples") in [(f.subject, f.text) for f in findings]
 
 
@@ -113,10 +114,10 @@ def test_a_recording_that_breaks_while_read_is_bad(monkeypatch: pytest.MonkeyPat
 
 
 def test_reading_stops_when_the_time_is_up() -> None:
-    (_, findings), = diagnose(Hospital({"ward": Ward(list(range(10, 100_000, 10)))}), reading_s=0.01)
+    ((_, findings),) = diagnose(Hospital({"ward": Ward(list(range(10, 100_000, 10)))}), reading_s=0.01)
     (reading,) = [f for f in findings if f.subject == "reading"]
     assert "the rest was not looked at" in reading.text
-    (_, opened_only), = diagnose(Hospital({"ward": Ward([10, 20])}), reading_s=0.0)
+    ((_, opened_only),) = diagnose(Hospital({"ward": Ward([10, 20])}), reading_s=0.0)
     assert [f.subject for f in opened_only] == ["pulse"]
 
 

@@ -6,6 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from inertial_truth import NOISE, make_rig, samples, windows_of
+from shared_data import shared_data
 from vioframe.errors import ConfigError
 from vioframe.geometry import quaternion, so3
 from vioframe.initialisation import (
@@ -16,9 +19,6 @@ from vioframe.initialisation import (
     rest_state,
 )
 from vioframe.types import ImuBlock, NavState
-
-from inertial_truth import NOISE, make_rig, samples, windows_of
-from shared_data import shared_data
 
 G = 9.81
 TILTED = so3.exp(np.array([0.4, -1.2, 0.3]))

@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+
 from vioframe.errors import PluginError, StateError, WiringError
 from vioframe.interfaces import (
     INERTIAL_DELTA,

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+
 from vioframe.errors import PluginError
 from vioframe.plugins import PluginPackage, core_conf, discover, refuse_clashes
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from vioframe.geometry import se3
 from vioframe.state_log import StateLog
 from vioframe.types import ImuBias, NavState

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
+
 from vioframe.sweep import conclude, failed_jobs, write_status
 from vioframe.sweep_summary import (
     COLUMNS,

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 import yaml
+
 from vioframe.errors import ConfigError, StateError
 from vioframe.tracking import (
     PARENT_RUN_VARIABLE,

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from shared_data import shared_data
 from vioframe import trajectory_io
 from vioframe.errors import ClockError, DataError
 from vioframe.geometry import se3, so3
 from vioframe.trajectory_io import read_trajectory, write_euroc, write_kitti, write_tum
 from vioframe.types import Trajectory
-
-from shared_data import shared_data
 
 IDENTITY_TUM = "0 0 0 0 0 0 1"
 

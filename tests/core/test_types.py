@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from vioframe.errors import ClockError, ShapeError
 from vioframe.geometry import se3, so3
 from vioframe.testing import make_scene, measurement_of

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from shared_data import shared_data
+from synthetic_runs import moved, walk
 from vioframe.errors import ConfigError, DataError, MetricError
 from vioframe.evaluation import EvaluationOptions
 from vioframe.geometry import se3, so3
 from vioframe.tasks.evaluate import evaluate_files, evaluate_to_folder
 from vioframe.trajectory_io import write_euroc, write_kitti, write_tum
-
-from shared_data import shared_data
-from synthetic_runs import moved, walk
 
 NO_PLOTS = EvaluationOptions(plots=False)
 SOMEWHERE = se3.from_parts(so3.rotation_z(0.7), np.array([1.0, 2.0, 3.0]))

@@ -3,11 +3,11 @@
 import cv2
 import numpy as np
 import pytest
+
+from geometry_tolerances import OPENCV_PIXELS, ROUNDING, UNDISTORTED, UNDISTORTED_CORNER
 from vioframe.geometry import camera as camera_model
 from vioframe.geometry import se3, so3
 from vioframe.types import Camera
-
-from geometry_tolerances import OPENCV_PIXELS, ROUNDING, UNDISTORTED, UNDISTORTED_CORNER
 
 PINHOLE = Camera(
     model="pinhole",

@@ -1,11 +1,11 @@
 """Poses between samples, and where there are none."""
 
 import numpy as np
+
+from geometry_tolerances import ROUNDING
 from vioframe.geometry import se3, so3
 from vioframe.geometry.interpolation import differentiate_positions, interpolate_poses
 from vioframe.types import Trajectory
-
-from geometry_tolerances import ROUNDING
 
 SECOND = 1_000_000_000
 START = 1_403_715_273_262_142_976
@@ -50,9 +50,7 @@ def test_outside_and_in_gaps_is_not_covered() -> None:
 
 def test_rotation_takes_the_short_way() -> None:
     R = so3.rotation_z(np.array([0.0, 3.0, 6.0]))
-    trajectory = Trajectory(
-        stamps_ns=START + np.arange(3) * SECOND, T_world_body=se3.from_parts(R, np.zeros((3, 3)))
-    )
+    trajectory = Trajectory(stamps_ns=START + np.arange(3) * SECOND, T_world_body=se3.from_parts(R, np.zeros((3, 3))))
     between = np.array([START + SECOND // 2, START + 3 * SECOND // 2])
     poses, _ = interpolate_poses(trajectory, between, max_gap_ns=SECOND)
     np.testing.assert_allclose(poses[:, :3, :3], so3.rotation_z(np.array([1.5, 4.5])), atol=ROUNDING)

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from vioframe.geometry import quaternion, so3
 
 from geometry_tolerances import ROUNDING
+from vioframe.geometry import quaternion, so3
 
 
 def test_the_scalar_comes_first() -> None:

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from vioframe.geometry import se3, so3
 
 from geometry_tolerances import NUMERICAL, ROUNDING
+from vioframe.geometry import se3, so3
 
 
 def tangents(count: int = 30, seed: int = 0, angle: float = 1.5) -> np.ndarray:

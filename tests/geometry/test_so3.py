@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from vioframe.geometry import so3
 
 from geometry_tolerances import NEAR_PI, NUMERICAL, ROUNDING
+from vioframe.geometry import so3
 
 ANGLES = [0.0, 1e-12, 1e-8, 0.99e-4, 1.01e-4, 1e-2, 0.5, 2.0, 3.0, np.pi - 1e-3]
 

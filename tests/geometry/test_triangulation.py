@@ -1,10 +1,10 @@
 """Exact rays meet in their point; parallel ones say so; noisy ones minimise what is stated."""
 
 import numpy as np
-from vioframe.geometry import se3, so3
-from vioframe.geometry.triangulation import triangulate
 
 from geometry_tolerances import TRIANGULATED
+from vioframe.geometry import se3, so3
+from vioframe.geometry.triangulation import triangulate
 
 
 def scene(views: int = 4, points: int = 30, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

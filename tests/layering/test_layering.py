@@ -62,7 +62,7 @@ def test_every_package_is_shipped():
 @pytest.mark.parametrize("folder", ["vioframe", "plugins"])
 def test_heavy_libraries_are_imported_where_they_are_needed(folder: str):
     """At module level they would cost every ``--help`` a second or more."""
-    heavy = {"mlflow", "matplotlib", "scipy", "rich", "torch", "lightning", "pandas"}
+    heavy = {"mlflow", "matplotlib", "scipy", "rich", "torch", "lightning", "pandas", "rosbags", "rerun"}
     for path in (ROOT / folder).rglob("*.py"):
         for node in ast.parse(path.read_text()).body:
             names = []

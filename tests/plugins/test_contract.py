@@ -1,11 +1,11 @@
 """Every discovered component keeps the promises of its interface."""
 
 import pytest
+
+from composing import composed, offered
 from vioframe.build import build
 from vioframe.pipeline import SLOTS
 from vioframe.testing import check_component
-
-from composing import composed, offered
 
 PARTS = [(slot, name) for slot in SLOTS for name in offered(slot) if name != "none"]
 

@@ -4,7 +4,15 @@ import json
 
 import pytest
 
-SHORT = ("dataset.duration_s=3", "dataset.standstill_s=0", "rig=blind", "frontend=none", "vo=none", "init=groundtruth", "tracker=none")
+SHORT = (
+    "dataset.duration_s=3",
+    "dataset.standstill_s=0",
+    "rig=blind",
+    "frontend=none",
+    "vo=none",
+    "init=groundtruth",
+    "tracker=none",
+)
 
 
 def test_strangers_fuser_runs_like_one_of_ours(install, cli, tmp_path):
@@ -18,6 +26,7 @@ def test_strangers_fuser_runs_like_one_of_ours(install, cli, tmp_path):
 def test_strangers_component_passes_the_conformance_checks(install, monkeypatch):
     monkeypatch.syspath_prepend(install("acme"))
     from acme_dead_reckoning import AcmeFuser
+
     from vioframe.testing import check_component
 
     check_component(AcmeFuser(damping=0.1))

@@ -127,11 +127,10 @@ def run_sequence(
     started = time.perf_counter()
     pipeline.setup(recording.rig, initial_state(init, truth, recording.name))
     users = lend_ground_truth(pipeline, truth, recording.name)
-    recorder = Recorder(folder, recording.name, wanted, progress)
-    observers = [recorder.watch]
     if viewer is not None:
         viewer.setup(recording.name, recording.rig, truth, folder)
-        observers.append(viewer.watch)
+    recorder = Recorder(folder, recording.name, wanted, progress)
+    observers = [recorder.watch] if viewer is None else [recorder.watch, viewer.watch]
     for observer in observers:
         pipeline.observe(observer)
     stop: BaseException | None = None

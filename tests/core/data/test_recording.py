@@ -4,6 +4,7 @@ import threading
 import time
 
 import pytest
+
 from vioframe.data.recording import prefetch
 from vioframe.errors import DataError
 from vioframe.types import Frame

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 from evo.core import geometry, metrics, sync
 from evo.tools import file_interface
+
+from shared_data import shared_data
+from synthetic_runs import SECOND, moved, walk
 from vioframe.errors import ConfigError, MetricError
 from vioframe.evaluation.align import (
     MatchedPoses,
@@ -17,9 +20,6 @@ from vioframe.evaluation.metrics import absolute_error
 from vioframe.geometry import se3, so3
 from vioframe.trajectory_io import read_trajectory
 from vioframe.types import Trajectory
-
-from shared_data import shared_data
-from synthetic_runs import SECOND, moved, walk
 
 SOMEWHERE = se3.from_parts(so3.exp(np.array([0.4, -1.1, 2.0])), np.array([3.0, -40.0, 7.0]))
 TURNED = se3.from_parts(so3.rotation_z(2.1), np.array([3.0, -40.0, 7.0]))

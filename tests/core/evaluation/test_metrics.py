@@ -7,6 +7,9 @@ import pytest
 from evo.core import metrics as evo_metrics
 from evo.core.trajectory import PosePath3D
 from scipy import stats
+
+from shared_data import shared_data
+from synthetic_runs import drifted, moved, walk
 from vioframe.errors import MetricError
 from vioframe.evaluation import metrics
 from vioframe.evaluation.align import MatchedPoses, Motion, align, associate
@@ -14,9 +17,6 @@ from vioframe.evaluation.states import StateColumns
 from vioframe.geometry import se3, so3
 from vioframe.trajectory_io import read_trajectory
 from vioframe.types import Trajectory
-
-from shared_data import shared_data
-from synthetic_runs import drifted, moved, walk
 
 LENGTHS = tuple(float(length) for length in range(100, 801, 100))
 

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.console import Console
+
+from synthetic_runs import make_run
 from vioframe.evaluation import EvaluationOptions, SequenceRun
 from vioframe.evaluation.plots import draw_run
 from vioframe.evaluation.report import folder_names, write_outputs
@@ -16,8 +18,6 @@ from vioframe.evaluation.rows import evaluate_run
 from vioframe.evaluation.table import render_rows
 from vioframe.evaluation.wording import significant
 from vioframe.trajectory_io import read_trajectory
-
-from synthetic_runs import make_run
 
 OPTIONS = EvaluationOptions()
 NO_PLOTS = EvaluationOptions(plots=False)

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
+from synthetic_runs import make_run, moved, walk
 from vioframe.errors import ClockError, ConfigError, MetricError
 from vioframe.evaluation import EvaluationOptions, SequenceRun
 from vioframe.evaluation.rows import compare_trajectories, evaluate_run, metrics_document
 from vioframe.geometry import se3, so3
 from vioframe.types import NavState
-
-from synthetic_runs import make_run, moved, walk
 
 ACCURACY = [
     "path_estimated_m",

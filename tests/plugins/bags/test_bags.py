@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+
 from vioframe.data.recording import prefetch
 from vioframe.data.simulator import CameraSettings, ImuSettings, SimulatedDataset
 from vioframe.errors import ClockError, ConfigError, DataError

@@ -4,13 +4,13 @@ import time
 
 import numpy as np
 import pytest
+
+from inertial_truth import even_stamps, exact_increment, make_rig, samples
 from vioframe.errors import ConfigError, StateError
 from vioframe.geometry import so3
 from vioframe.interfaces import InertialIntegrator
 from vioframe.testing import check_component
 from vioframe.types import ImuBias, ImuBlock, ImuNoise, InertialDelta
-
-from inertial_truth import even_stamps, exact_increment, make_rig, samples
 from vioframe_preintegration import PaperIntegrator, Preintegration, Strapdown
 
 START, END = 0.2, 1.8

@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
+from inertial_truth import NOISE, QUIET, even_stamps, make_rig, motion, samples, window_of, windows_of
+from shared_data import shared_data
 from vioframe.conventions import NANOSECONDS
 from vioframe.errors import ConfigError, StateError
 from vioframe.geometry import so3
 from vioframe.loose_fusion import StandstillOptions
 from vioframe.testing import check_component
 from vioframe.types import ImuBias, ImuBlock, ImuNoise, Measurement, NavState, SensorRig, SyncedWindow
-
-from inertial_truth import NOISE, QUIET, even_stamps, make_rig, motion, samples, window_of, windows_of
-from shared_data import shared_data
 from vioframe_preintegration import Preintegration
 from vioframe_reckoning import ImuOnlyFuser
 

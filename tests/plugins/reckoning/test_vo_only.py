@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+
+from inertial_truth import NOISE, even_stamps, motion, samples, windows_of
 from vioframe.conventions import NANOSECONDS
 from vioframe.errors import ConfigError, StateError
 from vioframe.geometry import se3, so3
 from vioframe.testing import check_component
 from vioframe.types import Camera, Measurement, NavState, RelativePose, SensorRig
-
-from inertial_truth import NOISE, even_stamps, motion, samples, windows_of
 from vioframe_reckoning import VoOnlyFuser
 
 T_BODY_CAM = se3.from_parts(so3.exp(np.array([1.2, -1.1, 1.3])), np.array([0.4, -0.2, 0.3]))

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from vioframe.checks import Array, Stamps
 from vioframe.geometry import quaternion, so3
 
@@ -103,8 +104,8 @@ def make_kitti(tmp_path: Path) -> Callable[..., Path]:
 
     def make(frames: int = 60) -> Path:
         from scipy.io import savemat
-        from vioframe.geometry import se3
 
+        from vioframe.geometry import se3
         from vioframe_recordings.kitti_calibration import odometry_drive
 
         drive = odometry_drive("06")

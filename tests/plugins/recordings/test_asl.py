@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from vioframe.errors import ClockError, DataError
 from vioframe.geometry import se3, so3
 from vioframe.types import Frame, ImuBlock
-
 from vioframe_recordings import EurocDataset, TumviDataset, screening
 from vioframe_recordings.asl import match_stamps, read_imu
 from vioframe_recordings.stored import BLOCK_NS, StoredRecording

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from vioframe.errors import ClockError, ConfigError, DataError, VioframeError
 
+from vioframe.errors import ClockError, ConfigError, DataError, VioframeError
 from vioframe_recordings import EurocDataset
 
 Change = Callable[[Path], None]

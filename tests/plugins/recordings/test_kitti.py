@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from vioframe.errors import ClockError, ConfigError, DataError
 from vioframe.geometry import so3
 from vioframe.types import Frame
-
 from vioframe_recordings import KittiDataset, KittiRawDataset
 from vioframe_recordings.kitti import level_world, read_imu_mat
 from vioframe_recordings.kitti_calibration import DRIVE_DATES, spline_velocities

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
+
+import vioframe_rerun.viewer as module
 from vioframe.errors import ConfigError, StateError
 from vioframe.geometry import se3, so3
 from vioframe.plugins import core_conf
@@ -27,8 +29,6 @@ from vioframe.types import (
     VisualFeatures,
 )
 from vioframe.viewer import build_viewer
-
-import vioframe_rerun.viewer as module
 from vioframe_rerun import RerunViewer
 
 HAS_RERUN = importlib.util.find_spec("rerun") is not None

@@ -5,12 +5,12 @@ import time
 
 import numpy as np
 import pytest
+
+from inertial_truth import NOISE, make_rig
 from vioframe.errors import ConfigError, StateError
 from vioframe.interfaces import Synchronizer
 from vioframe.testing import check_component
 from vioframe.types import Frame, ImuBlock, Packet, SyncedWindow
-
-from inertial_truth import NOISE, make_rig
 from vioframe_sync import InterpolateSynchronizer, NearestSynchronizer
 
 MS = 1_000_000

@@ -1,6 +1,7 @@
 """A stranger's plugin: dead reckoning whose velocity fades, as wheels and feet do."""
 
 import numpy as np
+
 from vioframe.conventions import gravity_vector
 from vioframe.geometry import se3
 from vioframe.interfaces import INERTIAL_DELTA, Fuser
