@@ -207,7 +207,8 @@ class Renderer:
         """Where rays leave the shell, from whose inside the world is seen; fills depth and face."""
         depth[...] = np.inf
         for axis in range(3):
-            forward = directions[axis] > 0.0
+            # By the sign bit, so that a ray along a wall (±0) leaves at +∞.
+            forward = ~np.signbit(directions[axis])
             plane = np.where(forward, tables.plane[2 * axis + 1], tables.plane[2 * axis])
             if shift is not None:
                 plane = plane - shift[axis, rows]

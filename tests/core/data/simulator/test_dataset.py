@@ -4,6 +4,7 @@ import hashlib
 
 import numpy as np
 import pytest
+
 from vioframe.checks import check_increasing
 from vioframe.data.simulator import CameraSettings, Degradations, ImuSettings, SimulatedDataset
 from vioframe.errors import ConfigError, DataError

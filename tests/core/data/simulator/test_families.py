@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from vioframe.data.simulator.degrade import Degradations
 from vioframe.data.simulator.families import FAMILIES, family_traits, plan_motion
 from vioframe.data.simulator.imaging import build_world

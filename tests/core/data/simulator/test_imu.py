@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from vioframe.checks import Array
 from vioframe.conventions import GRAVITY, NANOSECONDS, gravity_vector
 from vioframe.data.simulator.families import plan_motion
@@ -24,9 +25,7 @@ QUIET = {
 
 def standing(duration_s: float) -> SplineMotion:
     count = int(duration_s) + 7
-    return SplineMotion(
-        knot_s=1.0, positions=np.zeros((count, 3)), rotations=np.tile(np.eye(3), (count, 1, 1))
-    )
+    return SplineMotion(knot_s=1.0, positions=np.zeros((count, 3)), rotations=np.tile(np.eye(3), (count, 1, 1)))
 
 
 def sense(settings: ImuSettings, motion: SplineMotion, duration_s: float, seed: int = 0) -> list[ImuSamples]:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from vioframe.data.simulator.spline import ORDER, SplineMotion, basis_weights, control_times
 from vioframe.errors import ConfigError
 from vioframe.geometry import so3
