@@ -13,10 +13,6 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from vioframe_ekf import EkfFuser
-from vioframe_msf import MsfFuser
-from vioframe_preintegration import Preintegration
-from vioframe_sync import InterpolateSynchronizer
 
 from vioframe.data.simulated_vo import SimulatedVO
 from vioframe.data.simulator import CameraSettings, SimulatedDataset
@@ -25,6 +21,10 @@ from vioframe.initialisation import initial_covariance
 from vioframe.interfaces import Fuser
 from vioframe.pipeline import Pipeline
 from vioframe.types import ImuBias, NavState
+from vioframe_ekf import EkfFuser
+from vioframe_msf import MsfFuser
+from vioframe_preintegration import Preintegration
+from vioframe_sync import InterpolateSynchronizer
 
 BLOCKS = {"orientation": slice(0, 3), "position": slice(3, 6), "velocity": slice(6, 9), "all 15": slice(0, 15)}
 
@@ -85,7 +85,9 @@ def run_once(name: str, seed: int, family: str, seconds_long: float, fuser: Fuse
         error = rng.multivariate_normal(np.zeros(15), covariance)
         T = se3.from_parts(T[:3, :3] @ so3.exp(error[:3]).T, T[:3, 3] - error[3:6])
         given = ImuBias(gyro=bias[:3] - error[9:12], accel=bias[3:] - error[12:])
-        return NavState(stamp_ns=stamp_ns, T_world_body=T, v_world_body=v - error[6:9], bias=given, covariance=covariance)
+        return NavState(
+            stamp_ns=stamp_ns, T_world_body=T, v_world_body=v - error[6:9], bias=given, covariance=covariance
+        )
 
     pipeline.setup(recording.rig, initial_state=perturbed)
     vo.take_ground_truth(truth)
@@ -126,7 +128,8 @@ def main() -> None:
         runs = [run_once(name, seed, arguments.family, arguments.seconds) for seed in range(arguments.runs)]
         print(f"fuser={name}: {len(runs)} runs of {arguments.seconds:g} s ({arguments.family}), "
               f"{time.process_time() - started:.0f} s CPU, {np.mean([r.update_ms for r in runs]):.2f} ms an update, "
-              f"end error {np.mean([r.position_error_m for r in runs]):.3f} m on {np.mean([r.path_m for r in runs]):.1f} m")
+              f"end error {np.mean([r.position_error_m for r in runs]):.3f} m "
+              f"on {np.mean([r.path_m for r in runs]):.1f} m")
         for block in BLOCKS:
             values = np.array([run.nees[block] for run in runs])
             spread = values.std(ddof=1) / np.sqrt(len(values))

@@ -1,6 +1,7 @@
 """Seeded runs of the loosely coupled filters on simulated motion, and the benchmark that makes them."""
 
 import importlib.util
+import itertools
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -8,13 +9,13 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+
 from vioframe.data.simulated_vo import SimulatedVO
 from vioframe.data.simulator import CameraSettings, SimulatedDataset, SimulatedRecording
 from vioframe.geometry import so3
 from vioframe.interfaces import Fuser
 from vioframe.pipeline import Pipeline
 from vioframe.types import Measurement, NavState, Trajectory
-
 from vioframe_preintegration import Preintegration
 from vioframe_sync import InterpolateSynchronizer
 
@@ -59,12 +60,12 @@ class FilterRun:
         )
 
     def position_errors(self) -> np.ndarray:
-        return np.array([np.linalg.norm(s.T_world_body[:3, 3] - self.true_pose(s.stamp_ns)[:3, 3]) for s in self.states])
+        return np.array(
+            [np.linalg.norm(s.T_world_body[:3, 3] - self.true_pose(s.stamp_ns)[:3, 3]) for s in self.states]
+        )
 
     def rotation_errors(self) -> np.ndarray:
-        return np.array(
-            [so3.angle(s.T_world_body[:3, :3].T @ self.true_pose(s.stamp_ns)[:3, :3]) for s in self.states]
-        )
+        return np.array([so3.angle(s.T_world_body[:3, :3].T @ self.true_pose(s.stamp_ns)[:3, :3]) for s in self.states])
 
 
 def record(recording: SimulatedRecording, **vo_options: float) -> FilterRun:
@@ -112,7 +113,7 @@ def without_vo(measurement: Measurement) -> Measurement:
 def assert_honest(states: list[NavState]) -> None:
     """Every state is finite, every covariance exactly symmetric and positive, stamps increase."""
     stamps = [state.stamp_ns for state in states]
-    assert all(b > a for a, b in zip(stamps, stamps[1:], strict=False))
+    assert all(b > a for a, b in itertools.pairwise(stamps))
     for state in states:
         assert np.isfinite(state.T_world_body).all() and np.isfinite(state.v_world_body).all()
         np.testing.assert_array_equal(state.covariance, state.covariance.T)

@@ -308,7 +308,7 @@ class NoiseAdaptation:
     Data sheets state the noise of a sensor that does not shake. On a vehicle the white noise is larger, by a
     factor that depends on the vehicle, and a filter that believes the data sheet refuses good odometry. Here
     the logarithm of a variance factor follows the innovations (after Mehra, "Approaches to adaptive filtering",
-    IEEE TAC 1972): with χ² that of a block of three, over τ seconds it moves by ``min(χ²/3, 9) − 1.3``, never
+    IEEE TAC 1972): with χ² that of a block of three, over τ seconds it moves by ``min(χ²/3, 9) − 1.6``, never
     below zero. A filter whose noise is as stated has a mean of 1, so its factor stays at 1.
 
     Args:
@@ -316,7 +316,7 @@ class NoiseAdaptation:
         most: largest factor on a standard deviation; 1 adapts nothing.
     """
 
-    _TARGET = 1.3
+    _TARGET = 1.6
     _CAP = 9.0
 
     def __init__(self, time_s: float, most: float) -> None:

@@ -70,7 +70,7 @@ class InertialOptions:
     accel_noise_scale: float = 1.0
     walk_scale: float = 1.0
     adapt_most: float = 30.0
-    adapt_s: float = 0.3
+    adapt_s: float = 0.5
     gap_allowed_s: float = 0.05
     gap_rate_sigma: float = 0.5
     gap_accel_sigma: float = 2.0

@@ -3,6 +3,7 @@
 from typing import ClassVar
 
 import numpy as np
+
 from vioframe.checks import Array
 from vioframe.error_state import POSE, InertialFilter
 from vioframe.errors import StateError

@@ -1,9 +1,10 @@
 """Inertial propagation corrected by relative poses of unknown scale, drifting and late."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+
 from vioframe.checks import Array
 from vioframe.error_state import part_of
 from vioframe.errors import ConfigError
@@ -18,7 +19,6 @@ from vioframe.loose_fusion import (
     VisualOptions,
 )
 from vioframe.types import InertialDelta, NavState, Status
-
 from vioframe_msf.search import ScaleSearch
 from vioframe_msf.state import ScaledFilter
 
@@ -166,6 +166,11 @@ class MsfFuser(LooseFuser):
         """Standard deviation of the scale, relative."""
         return self._filter.scale_sigma
 
+    @property
+    def T_body_cam(self) -> Array:
+        """Place of camera 0 on the body, (4, 4), as calibrated or refined."""
+        return self._filter.T_body_cam
+
     def _new_filter(self) -> ScaledFilter:
         return ScaledFilter(
             noise=self._noise,
@@ -198,7 +203,14 @@ class MsfFuser(LooseFuser):
             return False
         if step.motion is None and not self._scale.kept_by_vo and self._filter.T_world_vision is not None:
             self._look_for_scale(self._filter.scale)
-        return self._track(late) if self._search is None else self._track_all(late, self._search)
+        if self._search is None:
+            return self._track(late)
+        if not late.at_rest:
+            return self._track_all(late, self._search)
+        # At rest nothing is learnt about the scale: one filter is as good as many, and needs no vision.
+        supported = self._track(replace(late, motion=None))
+        self._look_for_scale(self._scale.guess)
+        return supported
 
     def _delayed(self, step: Step) -> LateStep | None:
         """What the VO's late motion spans: the inertial increments up to then; None before the first state."""
@@ -267,12 +279,7 @@ class MsfFuser(LooseFuser):
             self._count("gated VO updates")
         search.reduce()
         self._filter = search.best
-        if late.at_rest:
-            supported = self._stand_still() or supported
-            self._filter.drop_clone()
-            # At rest nothing is learnt about the scale, and one filter is as good as many.
-            self._look_for_scale(self._scale.guess)
-        elif search.found(self._scale.known_sigma, self._scale.known_probability):
+        if search.found(self._scale.known_sigma, self._scale.known_probability):
             self._search = None
             self._was_known = True
         return supported

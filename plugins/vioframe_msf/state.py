@@ -8,6 +8,7 @@ Beyond the 15 inertial errors (see :mod:`vioframe.error_state`) there are 13::
 """
 
 import numpy as np
+
 from vioframe.checks import Array
 from vioframe.error_state import POSE, InertialFilter
 from vioframe.errors import StateError

