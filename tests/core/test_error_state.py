@@ -123,8 +123,13 @@ def test_conversion_of_errors_against_finite_differences(rng):
     def local(error):
         truth = retract(body, error)
         return np.concatenate(
-            [so3.log(body.R.T @ truth.R), truth.p - body.p, truth.v - body.v,
-             truth.bias.gyro - body.bias.gyro, truth.bias.accel - body.bias.accel]
+            [
+                so3.log(body.R.T @ truth.R),
+                truth.p - body.p,
+                truth.v - body.v,
+                truth.bias.gyro - body.bias.gyro,
+                truth.bias.accel - body.bias.accel,
+            ]
         )
 
     np.testing.assert_allclose(local_from_invariant(body), derivative(local, 15), atol=1e-6)
@@ -147,8 +152,13 @@ def test_bias_walk_moves_the_state_as_simulated(rng):
     jacobian = np.zeros((9, 6))
     jacobian[:3, :3] = -duration * np.eye(3)
     delta = InertialDelta(
-        delta_R=np.eye(3), delta_v=np.zeros(3), delta_p=np.zeros(3), duration_s=duration,
-        covariance=np.zeros((9, 9)), bias=ImuBias(), bias_jacobian=jacobian,
+        delta_R=np.eye(3),
+        delta_v=np.zeros(3),
+        delta_p=np.zeros(3),
+        duration_s=duration,
+        covariance=np.zeros((9, 9)),
+        bias=ImuBias(),
+        bias_jacobian=jacobian,
     )
     noise_map = np.zeros((15, 9))
     noise_map[:3, :3] = np.eye(3)
@@ -194,8 +204,10 @@ def test_parts_of_a_window_have_its_jacobians_and_noise():
     # The rule of powers of time holds for slow rotation; the walk turns by some degrees in 0.2 s.
     np.testing.assert_allclose(pieces[1][0] @ pieces[0][0], phi, atol=0.02)
     whole = noise_map @ delta.covariance @ noise_map.T
-    noises = [m @ part.covariance @ m.T for (_, m), part in
-              zip(pieces, (part_of(delta, 0.0, 0.1), part_of(delta, 0.1, 0.2)), strict=True)]
+    noises = [
+        m @ part.covariance @ m.T
+        for (_, m), part in zip(pieces, (part_of(delta, 0.0, 0.1), part_of(delta, 0.1, 0.2)), strict=True)
+    ]
     joined = pieces[1][0] @ noises[0] @ pieces[1][0].T + noises[1]
     np.testing.assert_allclose(np.diag(joined)[:9], np.diag(whole)[:9], rtol=0.1)
 
