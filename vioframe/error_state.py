@@ -303,13 +303,17 @@ class StandstillTest:
 
 
 class NoiseAdaptation:
-    """Raises the inertial noise while the odometry contradicts it more than both allow.
+    """Raises the stated noise of both sensors while they contradict each other more than it allows.
 
-    Data sheets state the noise of a sensor that does not shake. On a vehicle the white noise is larger, by a
-    factor that depends on the vehicle, and a filter that believes the data sheet refuses good odometry. Here
-    the logarithm of a variance factor follows the innovations (after Mehra, "Approaches to adaptive filtering",
-    IEEE TAC 1972): with χ² that of a block of three, over τ seconds it moves by ``min(χ²/3, 9) − 1.6``, never
-    below zero. A filter whose noise is as stated has a mean of 1, so its factor stays at 1.
+    Data sheets state the noise of a sensor that does not shake; on a vehicle it is larger, by a factor that
+    depends on the vehicle. Odometry states the noise of its points, and its steps share the error of the map.
+    A filter that believes both refuses good measurements. Here the logarithm of a variance factor follows the
+    innovations (after Mehra, "Approaches to adaptive filtering", IEEE TAC 1972): with χ² that of a block of
+    three, over τ seconds it moves by ``min(χ²/3, 9) − 1.6``, never below zero. Where the noise is as stated,
+    χ²/3 has a mean of 1, and the factor stays at 1.
+
+    Rotation is where cameras are good, so what contradicts there is the inertial sensor, and what shakes its
+    gyro shakes its accelerometer. Translation over one step is where the inertial sensor is good.
 
     Args:
         time_s: τ.
@@ -325,14 +329,14 @@ class NoiseAdaptation:
         self._logs = np.zeros(2)
 
     @property
-    def gyro(self) -> float:
-        """Factor on the gyro's noise."""
+    def inertial(self) -> float:
+        """Factor on the standard deviations of the inertial increments."""
         return float(np.exp(0.5 * self._logs[0]))
 
     @property
-    def accel(self) -> float:
-        """Factor on the accelerometer's noise: what shakes one sensor shakes both."""
-        return float(np.exp(0.5 * self._logs.max()))
+    def translation(self) -> float:
+        """Factor on the standard deviations of the odometry's translation."""
+        return float(np.exp(0.5 * self._logs[1]))
 
     def learn(self, residual: Array, S: Array, duration_s: float) -> None:
         """Take the innovation (6,), ordered (rotation, translation), of one window, and its covariance (6, 6)."""

@@ -59,7 +59,7 @@ class InertialOptions:
         gyro_noise_scale: factor on the gyro's white noise density of the rig.
         accel_noise_scale: factor on the accelerometer's.
         walk_scale: factor on the bias walk densities of the rig.
-        adapt_most: up to this factor the noise is raised while the odometry contradicts it; 1 for never.
+        adapt_most: up to this factor noise is raised while the sensors contradict each other; 1 for never.
         adapt_s: seconds in which it is.
         gap_allowed_s: a longer hole between samples widens the covariance.
         gap_rate_sigma: rad/s, unknown rate inside such a hole.
@@ -94,7 +94,7 @@ class InertialOptions:
 
     def scaled(self, delta: InertialDelta, adapted: NoiseAdaptation) -> InertialDelta:
         """The increment with the scaled covariance; that of v and p is the accelerometer's, near enough."""
-        gyro, accel = self.gyro_noise_scale * adapted.gyro, self.accel_noise_scale * adapted.accel
+        gyro, accel = self.gyro_noise_scale * adapted.inertial, self.accel_noise_scale * adapted.inertial
         if gyro == 1.0 and accel == 1.0:
             return delta
         factor = np.repeat([gyro, accel, accel], 3)
@@ -414,7 +414,9 @@ class LooseFuser(Fuser):
         if pose is None or not pose.valid:
             self._count("missing VO updates")
         else:
-            motion = VisualMotion(T_prev_cur=pose.T_prev_cur, covariance=self._visual.covariance_of(pose))
+            factor = np.repeat([1.0, self._adapted.translation], 3)
+            covariance = factor[:, None] * self._visual.covariance_of(pose) * factor
+            motion = VisualMotion(T_prev_cur=pose.T_prev_cur, covariance=covariance)
         return Step(delta=delta, motion=motion, at_rest=at_rest, current_ns=window.current.stamp_ns)
 
     def _coast_to(self, window: SyncedWindow) -> None:
