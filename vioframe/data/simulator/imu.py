@@ -240,17 +240,11 @@ class BlockCutter:
             if cut == 0:
                 return
             if cut < len(block):
-                yield _slice(block, 0, cut)
-                self._rest = _slice(block, cut, len(block))
+                yield block.cut(0, cut)
+                self._rest = block.cut(cut, len(block))
                 return
             self._rest = next(self._source, None)
             yield block
-
-
-def _slice(block: ImuBlock, start: int, end: int) -> ImuBlock:
-    return ImuBlock(
-        stamps_ns=block.stamps_ns[start:end], gyro=block.gyro[start:end], accel=block.accel[start:end]
-    )
 
 
 def join_stamps(first: Stamps, second: Stamps, *, apart_ns: int) -> Stamps:

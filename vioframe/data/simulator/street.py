@@ -159,18 +159,38 @@ class StreetBuilder:
 
     def _line_road(self, at: Array, heading: Array) -> None:
         """Dashes in the middle and pavements at the sides, wherever the road is straight."""
-        for index in range(0, len(at)):
-            if self._axis(heading[index]) is None:
-                continue
-            point, angle = at[index], heading[index]
-            if index % 4 == 0:
-                low, high = self._span(point, angle, (-1.5, 1.5), (LANE_M - 0.08, LANE_M + 0.08))
+        for index in range(0, len(at), 4):
+            if self._axis(heading[index]) is not None:
+                low, high = self._span(at[index], heading[index], (-1.5, 1.5), (LANE_M - 0.08, LANE_M + 0.08))
                 self._flat(low, high, 0.012, self._paint)
-            for side in (-1.0, 1.0):
-                near, far = LANE_M + side * _KERB_M, LANE_M + side * (_FRONTAGE_M - 0.1)
-                low, high = self._span(point, angle, (-0.5 * _STATION_M, 0.5 * _STATION_M), (near, far))
-                if self._path_distance(low, high, 3.2) > 3.2:
+        for side in (-1.0, 1.0):
+            # Slabs in a row become one, since every border drawn costs time.
+            low, high, last = np.zeros(2), np.zeros(2), -2
+            for index in range(len(at) + 1):
+                slab = self._slab(at[index], heading[index], side) if index < len(at) else None
+                fits = slab is not None and last == index - 1 and self._continues(low, high, slab)
+                if slab is not None and fits:
+                    low, high = np.minimum(low, slab[0]), np.maximum(high, slab[1])
+                    last = index
+                    continue
+                if last >= 0:
                     self._flat(low, high, 0.13, self._pavement)
+                    last = -2
+                if slab is not None:
+                    (low, high), last = slab, index
+
+    def _slab(self, point: Array, angle: float, side: float) -> tuple[Array, Array] | None:
+        """Corners in the plane of two metres of pavement, or None where there is none."""
+        if self._axis(angle) is None:
+            return None
+        near, far = LANE_M + side * _KERB_M, LANE_M + side * (_FRONTAGE_M - 0.1)
+        low, high = self._span(point, angle, (-0.5 * _STATION_M, 0.5 * _STATION_M), (near, far))
+        return (low, high) if self._path_distance(low, high, 3.2) > 3.2 else None
+
+    def _continues(self, low: Array, high: Array, slab: tuple[Array, Array]) -> bool:
+        """Whether a slab prolongs another, to at most forty metres."""
+        together = np.maximum(high, slab[1]) - np.minimum(low, slab[0])
+        return bool(together.min() < _FRONTAGE_M - 0.1 - _KERB_M + 0.01 and together.max() < 40.0)
 
     def _flat(self, low: Array, high: Array, thick: float, texture: int) -> None:
         corner = np.array([*low, self._ground])
@@ -237,12 +257,15 @@ class StreetBuilder:
         half = 0.5 * _CAR_M
         low, high = self._span(point, angle, (-half[0], half[0]), (left - half[1], left + half[1]))
         base = self._base(point)
-        corner, opposite = np.array([*low, self._ground]), np.array([*high, base + 0.85])
+        corner, opposite = np.array([*low, base]), np.array([*high, base + 0.85])
         side, end, glass, top = self._cars[int(rng.integers(len(self._cars)))]
         along_x = abs(np.cos(angle)) > 0.7
         skins = self._skins(corner, opposite, *((end, side) if along_x else (side, end)), top)
         if not self._try(corner, opposite, skins, 1.1):
             return
+        if base > self._ground:
+            foot = np.array([*low, self._ground]), np.array([*high, base])
+            self.plan.add_solid(*foot, self._skins(*foot, self._pavement, self._pavement, self._pavement))
         low, high = self._span(point, angle, (-1.3, 1.0), (left - 0.72, left + 0.72))
         corner, opposite = np.array([*low, base + 0.85]), np.array([*high, base + 1.45])
         self.plan.add_solid(corner, opposite, self._skins(corner, opposite, glass, glass, top))

@@ -150,7 +150,7 @@ def test_the_nearer_box_hides_the_farther() -> None:
     T_world_cam[:3, :3] = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     T_world_cam[:3, 3] = [0.0, 0.0, 2.0]
     view = renderer.render(T_world_cam)
-    fx, fy, cx, cy = PINHOLE.intrinsics_px
+    fx, _, cx, cy = PINHOLE.intrinsics_px
     assert view.depth[round(cy), round(cx)] == pytest.approx(2.0, abs=1e-5)
     beside = round(cx - fx * 0.8 / 3.0)
     assert view.depth[round(cy), beside] == pytest.approx(3.0, abs=1e-5)

@@ -141,8 +141,8 @@ def test_a_short_hole_is_bridged() -> None:
 
 
 def test_part_of_it_can_be_replayed_with_a_simulated_sensor() -> None:
-    again = replay(Known(), start_s=2.0, duration_s=3.0, imu="simulated", images=False,
-                   imu_settings=ImuSettings(rate_hz=100.0, gyro_noise=0.0, gyro_walk=0.0, gyro_bias_spread=0.0))  # fmt: skip
+    sensor = ImuSettings(rate_hz=100.0, gyro_noise=0.0, gyro_walk=0.0, gyro_bias_spread=0.0)
+    again = replay(Known(), start_s=2.0, duration_s=3.0, imu="simulated", images=False, imu_settings=sensor)
     assert again.rig.imu.rate_hz == 100.0
     blocks = [p for p in again.packets() if isinstance(p, ImuBlock)]
     stamps = np.concatenate([b.stamps_ns for b in blocks])
