@@ -43,7 +43,9 @@ def test_every_constructor_argument_is_in_the_yaml_and_nothing_else(group, name)
     assert found
     for key, node in found:
         cls = resolve_class(node["_target_"], key)
-        parameters = list(inspect.signature(cls.__init__).parameters.values())[1:]
+        # A class without a constructor of its own shows object's, which takes anything by its signature.
+        own = cls.__init__ is not object.__init__
+        parameters = list(inspect.signature(cls.__init__).parameters.values())[1:] if own else []
         assert not [p for p in parameters if p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL)], f"{key}: {cls}"
         assert {p.name for p in parameters} == set(node) - {"_target_"}, f"{key}: {cls}"
 

@@ -14,8 +14,11 @@ def run(config: "DictConfig") -> int:
     from rich.table import Table
 
     table = Table(title="vioframe plugins", title_justify="left")
-    for heading in ("package", "distribution", "version", "offers", "import"):
-        table.add_column(heading, overflow="fold")
+    for heading in ("package", "distribution", "version"):
+        table.add_column(heading, no_wrap=True)
+    table.add_column("offers", overflow="fold")
+    table.add_column("import", no_wrap=True)
+    problems = []
     for found in discover():
         problem = import_problem(found)
         table.add_row(
@@ -23,10 +26,14 @@ def run(config: "DictConfig") -> int:
             found.distribution,
             found.version,
             "\n".join(_by_group(found.options)) or "nothing",
-            "ok" if problem is None else f"[red]{problem}[/red]",
+            "ok" if problem is None else "[red]fails[/red]",
         )
+        if problem is not None:
+            problems.append(f"{found.package} does not import, and nobody who does not choose it is harmed: {problem}")
     console = Console()
     console.print(table)
+    for text in problems:
+        console.print(text, markup=False)
     console.print(f"What belongs to no plugin: {core_conf()}")
     return 0
 
