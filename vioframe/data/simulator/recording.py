@@ -62,7 +62,11 @@ class SimulatedRecording(Recording):
         self._degradations = degradations or Degradations()
         delay_ns = round(self._camera.delay_s * NANOSECONDS)
         self._rig = SensorRig(
-            cameras=self._camera.build(kit), imu=self._imu.noise, gravity=gravity, camera_delay_ns=delay_ns
+            cameras=self._camera.build(kit),
+            imu=self._imu.noise,
+            gravity=gravity,
+            camera_delay_ns=delay_ns,
+            has_images=self._camera.images,
         )
         rate_hz = self._camera.frame_rate_hz(kit)
         index = np.arange(int(np.floor(duration_s * rate_hz + 1e-6)) + 1)

@@ -132,7 +132,7 @@ class ReplayDataset(Dataset):
             end_ns = min(end_ns, begin_ns + round(self._duration_s * NANOSECONDS))
         step_s = float(np.median(np.diff(covered.stamps_ns))) / NANOSECONDS
         motion = fit_spline(covered, max(self._knot_s, step_s))
-        rig = replace(recording.rig, cameras=cameras[: self._cameras])
+        rig = replace(recording.rig, cameras=cameras[: self._cameras], has_images=self._camera_settings.images)
         settings = self._imu_settings
         if settings is None:
             noise = rig.imu

@@ -76,6 +76,7 @@ def test_splits_share_no_sequence() -> None:
 def test_the_default_walk_is_what_the_documentation_says() -> None:
     recording = SimulatedDataset(camera=BLIND).open("walk-0")
     camera = recording.rig.cameras[0]
+    assert not recording.rig.has_images
     assert (camera.model, camera.size_px, recording.frame_count) == ("radtan", (752, 480), 601)
     assert recording.duration_s == pytest.approx(30.0)
     path = recording.ground_truth().T_world_body[:, :3, 3]

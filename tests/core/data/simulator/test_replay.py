@@ -155,6 +155,7 @@ def test_images_are_drawn_with_the_calibration_of_the_source() -> None:
     recording = Known(cameras=2)
     again = replay(recording, cameras=2, duration_s=0.2)
     assert len(again.rig.cameras) == 2
+    assert again.rig.has_images and not recording.rig.has_images
     frame = next(p for p in again.packets() if isinstance(p, Frame))
     assert [image.shape for image in frame.images] == [(120, 160)] * 2
     assert all(image.std() > 10.0 for image in frame.images)
