@@ -81,15 +81,11 @@ class Scene:
         packets: list[Packet] = []
         for window in self.windows:
             if not packets:
-                packets += [_slice(self.imu, 0, 1), window.previous]
+                packets += [self.imu.cut(0, 1), window.previous]
             chosen = (self.imu.stamps_ns > window.previous.stamp_ns) & (self.imu.stamps_ns <= window.current.stamp_ns)
             first, last = np.flatnonzero(chosen)[[0, -1]]
-            packets += [_slice(self.imu, int(first), int(last) + 1), window.current]
+            packets += [self.imu.cut(int(first), int(last) + 1), window.current]
         return packets
-
-
-def _slice(imu: ImuBlock, start: int, stop: int) -> ImuBlock:
-    return ImuBlock(stamps_ns=imu.stamps_ns[start:stop], gyro=imu.gyro[start:stop], accel=imu.accel[start:stop])
 
 
 def make_scene(seed: int = 0) -> Scene:
@@ -123,7 +119,7 @@ def make_scene(seed: int = 0) -> Scene:
         SyncedWindow(
             previous=frames[k],
             current=frames[k + 1],
-            imu=_slice(imu, k * every, (k + 1) * every + 1),
+            imu=imu.cut(k * every, (k + 1) * every + 1),
             gap_ns=IMU_STEP_NS,
         )
         for k in range(FRAMES - 1)

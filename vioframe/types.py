@@ -62,6 +62,10 @@ class ImuBlock:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    def cut(self, start: int, end: int) -> "ImuBlock":
+        """Samples [start, end)."""
+        return ImuBlock(stamps_ns=self.stamps_ns[start:end], gyro=self.gyro[start:end], accel=self.accel[start:end])
+
 
 Packet = Frame | ImuBlock
 """What a recording yields, in the order in which it arrives."""

@@ -11,21 +11,25 @@ from pathlib import Path
 
 import numpy as np
 
-from vioframe.checks import Array, Stamps
-from vioframe.conventions import NANOSECONDS, seconds
+from vioframe.checks import Array, Mask, Stamps
+from vioframe.conventions import NANOSECONDS
+from vioframe.data import screening
 from vioframe.data.recording import Dataset, Finding
-from vioframe.errors import ConfigError, DataError
+from vioframe.data.selection import FrameSelection, as_names, check_camera_count, choose_frames
+from vioframe.errors import DataError
 from vioframe.geometry import se3, so3
 from vioframe.trajectory_io import read_times, read_trajectory
 from vioframe.types import Camera, ImuBlock, ImuNoise, SensorRig, Trajectory
-from vioframe_recordings import screening
-from vioframe_recordings.asl import as_list, check_span, find_root, names_in, select_frames, trim
+from vioframe_recordings.folders import find_images, find_root, names_in
 from vioframe_recordings.kitti_calibration import (
+    NOMINAL_RATE_HZ,
     DriveDate,
     odometry_drive,
     projection_matrix,
     read_key_numbers,
+    read_mat,
     rectified_camera,
+    sample_rate_hz,
     spline_velocities,
 )
 from vioframe_recordings.stored import StoredRecording, check_first_images
@@ -58,21 +62,22 @@ class KittiDataset(Dataset):
         accel_noise: float = 2e-2,
         accel_walk: float = 1e-3,
     ) -> None:
-        if cameras not in (1, 2):
-            raise ConfigError(f"dataset.cameras must be 1 or 2, got {cameras}")
-        check_span(every, start_s, duration_s)
+        self.camera_count = check_camera_count(cameras)
+        self.selection = FrameSelection(every=every, start_s=start_s, duration_s=duration_s)
         self.root = find_root(root, "kitti")
         self.images = images
-        self.camera_count = cameras
         self.color = color
-        self.every = every
-        self.start_s = start_s
-        self.duration_s = duration_s
         self.camera_delay_ns = round(camera_delay_s * NANOSECONDS)
         self.gravity = gravity
-        self.densities = (gyro_noise, gyro_walk, accel_noise, accel_walk)
+        self.noise = ImuNoise(
+            gyro_noise=gyro_noise,
+            gyro_walk=gyro_walk,
+            accel_noise=accel_noise,
+            accel_walk=accel_walk,
+            rate_hz=NOMINAL_RATE_HZ,
+        )
         # YAML reads 04 as the number 4.
-        self._names = [name.zfill(2) for name in as_list(sequence)] or self._all_sequences()
+        self._names = [name.zfill(2) for name in as_names(sequence)] or self._all_sequences()
 
     @property
     def sequences(self) -> Sequence[str]:
@@ -104,8 +109,8 @@ class KittiDataset(Dataset):
             raise DataError(f"{times_file}: {len(times_ns)} frames are too few for a recording: fetch the file again")
         imu_file = self.root / "imus_100hz_mat" / f"{sequence}.mat"
         imu = read_imu_mat(imu_file, times_ns)
-        step_s = seconds(int(np.median(np.diff(imu.stamps_ns))))
-        findings += screening.check_samples(imu, str(imu_file), 1.0 / step_s)
+        noise = replace(self.noise, rate_hz=sample_rate_hz(imu))
+        findings += screening.check_samples(imu, str(imu_file), noise.rate_hz)
         findings.append(check_vehicle_up(imu, str(imu_file)))
         truth = self._truth(sequence, drive, imu, times_ns, findings)
         if truth is not None:
@@ -114,27 +119,20 @@ class KittiDataset(Dataset):
             findings.append(check_level(imu, truth))
         usable, paths, missing = self._available(folder, len(times_ns), findings)
         cameras = self._cameras(folder, drive, paths, findings)
-        covered, finding = screening.check_frame_clock(times_ns, imu, self.camera_delay_ns, str(times_file))
-        findings.append(finding)
-        kept = select_frames(
-            times_ns, covered & usable, self.every, self.start_s, self.duration_s, str(times_file)
+        kept, found = choose_frames(
+            times_ns,
+            imu,
+            self.selection,
+            delay_ns=self.camera_delay_ns,
+            where=str(times_file),
+            truth=truth,
+            usable=usable,
         )
+        findings += found
         paths = [[files[i] for i in kept] for files in paths]
-        frame_stamps_ns = times_ns[kept]
-        findings.append(screening.check_frame_steps(frame_stamps_ns))
-        if truth is not None:
-            findings.append(screening.check_truth_of_frames(frame_stamps_ns + self.camera_delay_ns, truth))
         rig_cameras = cameras[: self.camera_count]
         if self.images:
             check_first_images(paths, rig_cameras, f"recording day {drive.date}", color=self.color)
-        gyro_noise, gyro_walk, accel_noise, accel_walk = self.densities
-        noise = ImuNoise(
-            gyro_noise=gyro_noise,
-            gyro_walk=gyro_walk,
-            accel_noise=accel_noise,
-            accel_walk=accel_walk,
-            rate_hz=1.0 / step_s,
-        )
         return StoredRecording(
             name=sequence,
             rig=SensorRig(
@@ -144,8 +142,8 @@ class KittiDataset(Dataset):
                 camera_delay_ns=self.camera_delay_ns,
                 has_images=self.images,
             ),
-            imu=trim(imu, frame_stamps_ns + self.camera_delay_ns),
-            frame_stamps_ns=frame_stamps_ns,
+            imu=imu,
+            frame_stamps_ns=times_ns[kept],
             image_paths=paths,
             truth=truth,
             findings=findings,
@@ -173,17 +171,13 @@ class KittiDataset(Dataset):
 
     def _available(
         self, folder: Path, count: int, findings: list[Finding]
-    ) -> tuple[np.ndarray, list[list[Path]], int]:
+    ) -> tuple[Mask, list[list[Path]], int]:
         """Which frames have all their images, the files by camera, and how many are missing in between."""
         if not self.images:
             return np.ones(count, dtype=bool), [], 0
-        usable = np.ones(count, dtype=bool)
-        paths = []
-        for image_folder in self._image_folders(folder):
-            names = names_in(image_folder)
-            files = [image_folder / f"{index:06d}.png" for index in range(count)]
-            usable &= np.array([path.name in names for path in files])
-            paths.append(files)
+        names = [f"{index:06d}.png" for index in range(count)]
+        paths = [[image_folder / name for name in names] for image_folder in self._image_folders(folder)]
+        usable = find_images(paths)
         if usable.sum() < 2:
             raise DataError(
                 f"{paths[0][0].parent}: has images of {int(usable.sum())} of {count} frames: fetch them, or set "
@@ -238,18 +232,12 @@ def read_imu_mat(path: Path, times_ns: Stamps) -> ImuBlock:
     Raises:
         DataError: missing or damaged file, another number of samples, NaN.
     """
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
-
     if not path.is_file():
         raise DataError(
             f"{path}: no such file; it should hold the inertial samples of this sequence, ten an image interval: fetch "
             "it, or take another sequence"
         )
-    try:
-        content = loadmat(path)
-    except (MatReadError, ValueError, NotImplementedError, OSError, TypeError, EOFError) as error:
-        raise DataError(f"{path}: cannot be read as a MATLAB 5 file ({error}): fetch it again") from None
+    content = read_mat(path)
     names = [name for name in content if not name.startswith("__")]
     if "imu_data_interp" not in names:
         raise DataError(f"{path}: the variable 'imu_data_interp' is missing; the file has {', '.join(names) or 'none'}")

@@ -1,4 +1,4 @@
-"""What KITTI odometry and KITTI raw share: extrinsics by drive date, projection matrices, spline velocities.
+"""What KITTI odometry and KITTI raw share: calibration by drive date and from files, MATLAB files, spline velocities.
 
 Geiger et al., "Vision meets robotics: the KITTI dataset", IJRR 2013. The vehicle frame (x forward, y left, z up)
 is that of the OXTS RT3003, and is our body.
@@ -14,7 +14,7 @@ from vioframe.checks import Array, Stamps
 from vioframe.conventions import seconds
 from vioframe.errors import DataError
 from vioframe.geometry import se3, so3
-from vioframe.types import Camera
+from vioframe.types import Camera, ImuBlock
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,6 +85,15 @@ _ODOMETRY_DATES = {
 }
 
 
+NOMINAL_RATE_HZ = 100.0
+"""Of the OXTS RT3003, Hz."""
+
+
+def sample_rate_hz(imu: ImuBlock) -> float:
+    """Rate of the samples as they are in the file: interpolated or synchronised ones are not at the nominal rate."""
+    return 1e9 / float(np.median(np.diff(imu.stamps_ns)))
+
+
 def drive_date(date: str) -> DriveDate | None:
     """Calibration of a recording day, or None where it is not known."""
     return next((known for known in DRIVE_DATES if known.date == date), None)
@@ -128,6 +137,22 @@ def read_key_numbers(path: Path, *, required: tuple[str, ...]) -> Mapping[str, A
     return found
 
 
+def read_mat(path: Path) -> Mapping[str, Array]:
+    """Variables of a MATLAB 5 file.
+
+    Raises:
+        DataError: missing or damaged.
+    """
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        content: Mapping[str, Array] = loadmat(path)
+    except (MatReadError, ValueError, NotImplementedError, OSError, TypeError, EOFError) as error:
+        raise DataError(f"{path}: cannot be read as a MATLAB 5 file ({error}): fetch it again") from None
+    return content
+
+
 def projection_matrix(path: Path, values: Mapping[str, Array], key: str) -> Array:
     """P (3, 4) of a rectified camera.
 
@@ -150,6 +175,77 @@ def rectified_camera(P: Array, T_body_cam0: Array, size_px: tuple[int, int]) -> 
         size_px=size_px,
         T_body_cam=T_body_cam0 @ T_cam0_cam,
     )
+
+
+def _body_to_cam0(day: Path) -> Array:
+    """T_cam0_body (4, 4), of the unrectified camera 0, through the laser scanner."""
+    chain = np.eye(4)
+    for name in ("calib_imu_to_velo.txt", "calib_velo_to_cam.txt"):
+        values = read_key_numbers(day / name, required=("R", "T"))
+        chain = se3.from_parts(_matrix(day / name, values, "R"), _sized(day / name, values, "T", 3)) @ chain
+    return chain
+
+
+def _sized(path: Path, values: Mapping[str, Array], key: str, size: int) -> Array:
+    if values[key].size != size:
+        raise DataError(f"{path}: the key {key!r} should have {size} numbers, got {values[key].size}: repair it")
+    return values[key]
+
+
+def _matrix(path: Path, values: Mapping[str, Array], key: str) -> Array:
+    return _sized(path, values, key, 9).reshape(3, 3)
+
+
+def _size_px(path: Path, values: Mapping[str, Array], key: str) -> tuple[int, int]:
+    width, height = _sized(path, values, key, 2)
+    return int(width), int(height)
+
+
+def rectified_cameras(day: Path, indices: tuple[int, int]) -> tuple[Camera, ...]:
+    """Rectified cameras of a day, as in ``_sync`` drives: ``p_rect = R_rect_00 T_velo_cam T_imu_velo p_body``.
+
+    Raises:
+        DataError: with the file and the key.
+    """
+    path = day / "calib_cam_to_cam.txt"
+    keys = tuple(f"{name}_{index:02d}" for index in indices for name in ("P_rect", "S_rect"))
+    values = read_key_numbers(path, required=("R_rect_00", *keys))
+    R_rect = _matrix(path, values, "R_rect_00")
+    T_rect_body = se3.from_parts(R_rect, np.zeros(3)) @ _body_to_cam0(day)
+    return tuple(
+        rectified_camera(
+            projection_matrix(path, values, f"P_rect_{index:02d}"),
+            se3.inverse(T_rect_body),
+            _size_px(path, values, f"S_rect_{index:02d}"),
+        )
+        for index in indices
+    )
+
+
+def raw_cameras(day: Path, indices: tuple[int, int]) -> tuple[Camera, ...]:
+    """Unrectified cameras of a day, as in ``_extract`` drives: ``p_i = R_i p_0 + T_i``.
+
+    Raises:
+        DataError: with the file and the key.
+    """
+    path = day / "calib_cam_to_cam.txt"
+    keys = tuple(f"{name}_{index:02d}" for index in indices for name in ("K", "D", "S", "R", "T"))
+    values = read_key_numbers(path, required=keys)
+    T_cam0_body = _body_to_cam0(day)
+    cameras = []
+    for index in indices:
+        K = _matrix(path, values, f"K_{index:02d}")
+        T_cam_cam0 = se3.from_parts(_matrix(path, values, f"R_{index:02d}"), _sized(path, values, f"T_{index:02d}", 3))
+        cameras.append(
+            Camera(
+                model="radtan",
+                intrinsics_px=np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]),
+                distortion=_sized(path, values, f"D_{index:02d}", 5),
+                size_px=_size_px(path, values, f"S_{index:02d}"),
+                T_body_cam=se3.inverse(T_cam_cam0 @ T_cam0_body),
+            )
+        )
+    return tuple(cameras)
 
 
 # Of 1e-4 … 3e-1, this came closest to the velocity changes over 1 s that the accelerometers of sequences 01,

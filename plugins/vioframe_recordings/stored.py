@@ -1,4 +1,4 @@
-"""A recording that has been read and checked: samples in memory, images on disk."""
+"""A recording whose samples are in memory, and whose images are files."""
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
@@ -7,30 +7,25 @@ from pathlib import Path
 import numpy as np
 
 from vioframe.checks import Stamps
-from vioframe.conventions import seconds
-from vioframe.data.recording import Finding, Recording
+from vioframe.data.checked import CheckedRecording, size_mismatch
+from vioframe.data.recording import Finding
+from vioframe.data.selection import sample_span
 from vioframe.errors import DataError
 from vioframe.types import Camera, Frame, Image, ImuBlock, Packet, SensorRig, Trajectory
 
 log = logging.getLogger(__name__)
 
-BLOCK_NS = 50_000_000
-"""Longest inertial block: what a driver would deliver where no image cuts it earlier."""
 
-
-class StoredRecording(Recording):
-    """Samples in memory, images decoded one at a time as they are asked for.
+class StoredRecording(CheckedRecording):
+    """Images are decoded one at a time as they are asked for.
 
     Inertial samples come in blocks that end with the first sample at or after each frame, followed by the
     frame, so that a synchronizer can close a window at once.
 
-    Attributes:
-        name: of the sequence.
-
     Args:
         name: of the sequence.
         rig: calibration, also of cameras whose images are not read (``has_images``).
-        imu: all samples, IMU clock.
+        imu: all samples, IMU clock; those long before the first and after the last frame are left out.
         frame_stamps_ns: (F,) increasing, camera clock.
         image_paths: for each streamed camera the F files; empty streams stamps only.
         truth: poses of the body on the IMU clock, or None.
@@ -52,44 +47,18 @@ class StoredRecording(Recording):
         color: bool = False,
         missing_images: int = 0,
     ) -> None:
-        self.name = name
-        self.imu = imu
-        self.frame_stamps_ns = frame_stamps_ns
-        self._rig = rig
+        trimmed = imu.cut(*sample_span(imu, frame_stamps_ns + rig.camera_delay_ns))
+        super().__init__(
+            name=name, rig=rig, imu=trimmed, frame_stamps_ns=frame_stamps_ns, truth=truth, findings=findings
+        )
         self._image_paths = image_paths
-        self._truth = truth
-        self._findings = list(findings)
         self._color = color
         self._missing = missing_images
-        self._corrupt = 0
-
-    @property
-    def rig(self) -> SensorRig:
-        """Calibration."""
-        return self._rig
-
-    @property
-    def frame_count(self) -> int:
-        """Number of frames; corrupt ones, which are only met on the way, are counted here."""
-        return len(self.frame_stamps_ns)
-
-    @property
-    def duration_s(self) -> float:
-        """Seconds from the first to the last frame."""
-        return seconds(int(self.frame_stamps_ns[-1] - self.frame_stamps_ns[0])) if self.frame_count else 0.0
-
-    def ground_truth(self) -> Trajectory | None:
-        """True poses of the IMU, or None."""
-        return self._truth
-
-    def findings(self) -> list[Finding]:
-        """What the checks on opening found."""
-        return list(self._findings)
 
     def counters(self) -> Mapping[str, int]:
         """Images that could not be decoded since :meth:`packets` began, and files that were not there."""
-        counts = {"corrupt images": self._corrupt, "missing images": self._missing}
-        return {name: count for name, count in counts.items() if count}
+        missing = {"missing images": self._missing} if self._missing else {}
+        return {**super().counters(), **missing}
 
     def packets(self) -> Iterator[Packet]:
         """Stream from the start; memory stays flat, since an image lives as long as its frame is held."""
@@ -104,15 +73,6 @@ class StoredRecording(Recording):
             if frame is not None:
                 yield frame
         yield from self._blocks(done, len(self.imu))
-
-    def _blocks(self, start: int, end: int) -> Iterator[ImuBlock]:
-        stamps_ns = self.imu.stamps_ns
-        while start < end:
-            stop = min(max(int(np.searchsorted(stamps_ns, stamps_ns[start] + BLOCK_NS)), start + 1), end)
-            yield ImuBlock(
-                stamps_ns=stamps_ns[start:stop], gyro=self.imu.gyro[start:stop], accel=self.imu.accel[start:stop]
-            )
-            start = stop
 
     def _frame(self, index: int) -> Frame | None:
         images = []
@@ -142,14 +102,6 @@ def read_image(path: Path, *, color: bool = False) -> Image | None:
     # Decoding from memory keeps OpenCV from printing its own warnings about files to the terminal.
     image = cv2.imdecode(encoded, cv2.IMREAD_COLOR_RGB if color else cv2.IMREAD_GRAYSCALE)
     return None if image is None else np.asarray(image, dtype=np.uint8)
-
-
-def size_mismatch(image: Image, camera: Camera) -> str:
-    """What is wrong with the size of an image, or an empty text."""
-    height, width = image.shape[:2]
-    if (width, height) == tuple(camera.size_px):
-        return ""
-    return f"the image is {width}×{height} px but the calibration says {camera.size_px[0]}×{camera.size_px[1]}"
 
 
 def check_first_images(

@@ -8,12 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vioframe.data import screening
+from vioframe.data.checked import BLOCK_NS
+from vioframe.data.selection import match_stamps
 from vioframe.errors import ClockError, DataError
 from vioframe.geometry import se3, so3
 from vioframe.types import Frame, ImuBlock
-from vioframe_recordings import EurocDataset, TumviDataset, screening
-from vioframe_recordings.asl import match_stamps, read_imu
-from vioframe_recordings.stored import BLOCK_NS, StoredRecording
+from vioframe_recordings import EurocDataset, TumviDataset
+from vioframe_recordings.asl_files import read_imu
+from vioframe_recordings.stored import StoredRecording
 
 Maker = Callable[..., Path]
 

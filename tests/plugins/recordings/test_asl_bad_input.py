@@ -167,7 +167,7 @@ CASES: dict[str, tuple[Change, type[VioframeError], str]] = {
     "calibration no rotation": (
         replace("cam0/sensor.yaml", "data: [1.0,", "data: [1.1,"),
         DataError,
-        r"cam0/sensor.yaml: T_BS is not a rigid motion",
+        r"cam0/sensor.yaml: T_BS must be a rigid motion",
     ),
     "calibration too short": (
         replace("cam0/sensor.yaml", "[60.0, 61.0, 31.5, 23.5]", "[60.0, 61.0]"),

@@ -12,7 +12,7 @@ from vioframe.types import Frame
 from vioframe_recordings import KittiDataset, KittiRawDataset
 from vioframe_recordings.kitti import level_world, read_imu_mat
 from vioframe_recordings.kitti_calibration import DRIVE_DATES, spline_velocities
-from vioframe_recordings.kitti_raw import read_date_stamps
+from vioframe_recordings.kitti_inertial import read_date_stamps
 
 Maker = Callable[..., Path]
 

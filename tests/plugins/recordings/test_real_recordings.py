@@ -8,10 +8,11 @@ import pytest
 
 from shared_data import shared_data
 from vioframe.checks import Array
+from vioframe.data import screening
 from vioframe.errors import DataError
 from vioframe.geometry.interpolation import interpolate_poses
 from vioframe.types import Frame, ImuBlock, Trajectory
-from vioframe_recordings import EurocDataset, KittiDataset, KittiRawDataset, TumviDataset, screening
+from vioframe_recordings import EurocDataset, KittiDataset, KittiRawDataset, TumviDataset
 from vioframe_recordings.kitti import check_level
 from vioframe_recordings.kitti_calibration import drive_date
 from vioframe_recordings.stored import StoredRecording

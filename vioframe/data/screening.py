@@ -4,7 +4,7 @@ from itertools import permutations, product
 
 import numpy as np
 
-from vioframe.checks import Array, Stamps
+from vioframe.checks import Array, Mask, Stamps
 from vioframe.conventions import GRAVITY, seconds
 from vioframe.data.recording import Finding
 from vioframe.errors import ClockError, DataError
@@ -33,7 +33,7 @@ def check_samples(imu: ImuBlock, where: str, rate_hz: float) -> list[Finding]:
 
     Args:
         imu: all samples.
-        where: file, for messages.
+        where: file or topic, for messages.
         rate_hz: nominal rate.
 
     Raises:
@@ -117,14 +117,41 @@ def find_quiet(imu: ImuBlock, window_s: float = 1.0) -> tuple[int, int] | None:
     return None
 
 
-def check_frame_clock(frame_stamps_ns: Stamps, imu: ImuBlock, delay_ns: int, where: str) -> tuple[np.ndarray, Finding]:
+def find_gaps(stamps_ns: Stamps, max_gap_ns: int) -> Stamps:
+    """Indices of the samples before holes: steps longer than ``max_gap_ns`` and than twice the usual one."""
+    if len(stamps_ns) < 2:
+        return np.zeros(0, dtype=np.int64)
+    steps = np.diff(stamps_ns)
+    found: Stamps = np.flatnonzero(steps > max(max_gap_ns, 2 * float(np.median(steps)))).astype(np.int64)
+    return found
+
+
+def describe_gaps(stamps_ns: Stamps, before: Stamps) -> str:
+    """Number and longest of the holes after the samples ``before``, of which there is at least one."""
+    lengths = stamps_ns[before + 1] - stamps_ns[before]
+    longest = int(np.argmax(lengths))
+    return (
+        f"{len(before)} hole{'s' * (len(before) > 1)}, the longest {seconds(int(lengths[longest])):.3f} s after stamp "
+        f"{int(stamps_ns[before[longest]])}"
+    )
+
+
+def check_gaps(stamps_ns: Stamps, max_gap_ns: int) -> Finding:
+    """Holes between the inertial samples, where they are left to the synchronizer."""
+    before = find_gaps(stamps_ns, max_gap_ns)
+    if not len(before):
+        return Finding(level="good", subject="imu gaps", text="none")
+    return Finding(level="note", subject="imu gaps", text=f"{describe_gaps(stamps_ns, before)}; kept as they are")
+
+
+def check_frame_clock(frame_stamps_ns: Stamps, imu: ImuBlock, delay_ns: int, where: str) -> tuple[Mask, Finding]:
     """Which frames the inertial samples cover.
 
     Args:
         frame_stamps_ns: (F,) camera clock.
         imu: all samples.
         delay_ns: ``t_imu = t_cam + delay``.
-        where: file of the camera's stamps, for messages.
+        where: file or topic of the camera's stamps, for messages.
 
     Returns:
         covered (F,), and what to tell.
@@ -138,7 +165,7 @@ def check_frame_clock(frame_stamps_ns: Stamps, imu: ImuBlock, delay_ns: int, whe
     if covered.sum() < 2:
         raise ClockError(
             f"{where}: the camera runs from {int(on_imu[0])} to {int(on_imu[-1])} ns and the IMU from {first} to "
-            f"{last} ns, which do not overlap: check that both are in ns on one clock, or set dataset.camera_delay_s"
+            f"{last} ns, which do not overlap: check that both are in ns by one clock, or set dataset.camera_delay_s"
         )
     left_out = int((~covered).sum())
     if left_out:
@@ -155,7 +182,8 @@ def check_frame_steps(frame_stamps_ns: Stamps) -> Finding:
     text = f"{1e9 / usual:.2f} Hz, {len(frame_stamps_ns)} frames"
     if holes:
         longest = seconds(int(steps.max()))
-        return Finding(level="note", subject="frame rate", text=f"{text}; {holes} holes, the longest {longest:.3f} s")
+        text += f"; {holes} hole{'s' * (holes > 1)}, the longest {longest:.3f} s"
+        return Finding(level="note", subject="frame rate", text=text)
     return Finding(level="good", subject="frame rate", text=text)
 
 
@@ -169,15 +197,29 @@ def check_truth_of_frames(frame_stamps_ns: Stamps, truth: Trajectory) -> Finding
     return Finding(level="good" if level_good else "note", subject="ground truth of the frames", text=text)
 
 
-def check_with_truth(imu: ImuBlock, truth: Trajectory, where: str, *, vertical: bool = True) -> list[Finding]:
-    """Compare the gyro with the true rotation, and the accelerometer with the vertical if so wished.
+def check_with_truth(
+    imu: ImuBlock,
+    truth: Trajectory,
+    where: str,
+    *,
+    vertical: bool = True,
+    advice: str = "check the calibration and the ground-truth file",
+) -> list[Finding]:
+    """Compare the gyro with the true rotation, and the accelerometer with the true motion.
+
+    Args:
+        imu: all samples.
+        truth: poses of the body.
+        where: file or topic of the samples, for messages.
+        vertical: also compare the accelerometer with the vertical.
+        advice: what to look at where the two do not belong together.
 
     Raises:
         DataError: the gyro is in degrees, or the accelerometer does not measure +g upwards.
     """
     overlap = (imu.stamps_ns >= truth.stamps_ns[0]) & (imu.stamps_ns <= truth.stamps_ns[-1])
     if len(truth) < 10 or overlap.sum() < 10:
-        text = "it hardly overlaps with the IMU, so that errors cannot be told: take another file or none"
+        text = "it hardly overlaps with the IMU, so that errors cannot be told: take another or none"
         return [Finding(level="bad", subject="ground truth", text=text)]
     share = 100.0 * float(overlap.mean())
     findings = [
@@ -189,10 +231,10 @@ def check_with_truth(imu: ImuBlock, truth: Trajectory, where: str, *, vertical: 
         longest = seconds(int(steps.max()))
         text = f"{holes} drop-outs, the longest {longest:.2f} s; they are kept as they are"
         findings.append(Finding(level="note", subject="ground truth gaps", text=text))
-    findings += _check_rotation(imu, truth, where)
-    findings += _check_force(imu, truth, where)
+    findings += _check_rotation(imu, truth, where, advice)
+    findings += _check_force(imu, truth, where, advice)
     if vertical:
-        findings += _check_vertical(imu, truth, where)
+        findings += _check_vertical(imu, truth, where, advice)
     return findings
 
 
@@ -230,7 +272,7 @@ def correlations(measured: Array, true: Array) -> Array:
     return values
 
 
-def _check_rotation(imu: ImuBlock, truth: Trajectory, where: str) -> list[Finding]:
+def _check_rotation(imu: ImuBlock, truth: Trajectory, where: str, advice: str) -> list[Finding]:
     measured, true = rotation_rates(imu, truth)
     if len(true) < 10 or true.std() < 0.01:
         return [Finding(level="note", subject="gyro and ground truth", text="too little rotation to compare")]
@@ -245,14 +287,14 @@ def _check_rotation(imu: ImuBlock, truth: Trajectory, where: str) -> list[Findin
     if axes:
         raise DataError(
             f"{where}: the gyro agrees with the rotation of the ground truth only when its axes are taken as {axes}: "
-            "they are swapped, or the ground truth is that of another frame; put them right"
+            f"they are swapped, or the ground truth is that of another frame; {advice}"
         )
     # Axes about which the body hardly turns show the noise of the truth, not agreement.
     axis = int(np.argmax(true.std(axis=0)))
     values = correlations(measured, true)
     text = f"correlation {values[0]:.4f}, {values[1]:.4f}, {values[2]:.4f} (x, y, z), scale {scale:.3f}"
     if values[axis] < 0.8 or abs(scale - 1.0) > 0.2:
-        text += ": axes, clock or unit of the two disagree; check the calibration and the ground-truth file"
+        text += f": axes, clock or unit of the two disagree; {advice}"
         return [Finding(level="bad", subject="gyro and ground truth", text=text)]
     return [Finding(level="good", subject="gyro and ground truth", text=text)]
 
@@ -299,7 +341,7 @@ def specific_forces(imu: ImuBlock, truth: Trajectory, interval_s: float = 0.5) -
     return means[0][filled], means[1][filled]
 
 
-def _check_force(imu: ImuBlock, truth: Trajectory, where: str) -> list[Finding]:
+def _check_force(imu: ImuBlock, truth: Trajectory, where: str, advice: str) -> list[Finding]:
     measured, true = specific_forces(imu, truth)
     if len(measured) < FEWEST_INTERVALS:
         return []
@@ -307,7 +349,7 @@ def _check_force(imu: ImuBlock, truth: Trajectory, where: str) -> list[Finding]:
     if axes:
         raise DataError(
             f"{where}: the accelerometer agrees with the motion of the ground truth only when its axes are taken as "
-            f"{axes}: they are swapped or turned; put them right"
+            f"{axes}: they are swapped or turned; {advice}"
         )
     misfit = float(np.sqrt(((measured - true) ** 2).sum(axis=1).mean()))
     text = f"within {misfit:.2f} m/s² of the true motion over intervals of 0.5 s (bias and errors of attitude)"
@@ -338,7 +380,7 @@ def tilt_deg(force: Array) -> float:
     return float(np.degrees(np.arctan2(np.hypot(force[0], force[1]), force[2])))
 
 
-def _check_vertical(imu: ImuBlock, truth: Trajectory, where: str) -> list[Finding]:
+def _check_vertical(imu: ImuBlock, truth: Trajectory, where: str, advice: str) -> list[Finding]:
     force, count = mean_specific_force(imu, truth)
     if count < 10:
         return []
@@ -347,7 +389,7 @@ def _check_vertical(imu: ImuBlock, truth: Trajectory, where: str) -> list[Findin
         guess = "its sign is turned over" if tilt > 160.0 else "its axes are swapped or those of another frame"
         raise DataError(
             f"{where}: in the attitude of the ground truth the accelerometer reads {size:.2f} m/s² at {tilt:.0f}° from "
-            f"the vertical on average, instead of about 9.81 m/s² upwards: {guess}; put them right"
+            f"the vertical on average, instead of about 9.81 m/s² upwards: {guess}; {advice}"
         )
     text = f"specific force in the world is {size:.2f} m/s² at {tilt:.2f}° from the vertical on average"
     if tilt > TILT_NOTE_DEG:
