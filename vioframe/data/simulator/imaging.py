@@ -10,7 +10,7 @@ from vioframe.data.simulator.degrade import Degradations
 from vioframe.data.simulator.drive import BODY_HEIGHT_M
 from vioframe.data.simulator.families import PlannedMotion
 from vioframe.data.simulator.render import Renderer, View
-from vioframe.data.simulator.rooms import build_room
+from vioframe.data.simulator.rooms import PATH_STEP_S, build_room
 from vioframe.data.simulator.street import build_street
 from vioframe.data.simulator.texture import Atlas
 from vioframe.data.simulator.world import World, WorldPlan
@@ -28,7 +28,7 @@ _BLUR_SAMPLES = 7
 def build_world(plan: PlannedMotion, seed: int, duration_s: float, degradations: Degradations) -> WorldPlan:
     """The place a motion needs, always the same for the same seed."""
     rng = np.random.default_rng([seed, 20])
-    times = np.arange(0.0, duration_s + 0.1, 0.1)
+    times = np.arange(0.0, duration_s + PATH_STEP_S, PATH_STEP_S)
     path = plan.motion.evaluate(times).T_world_body[:, :3, 3]
     if plan.place == "street":
         return build_street(

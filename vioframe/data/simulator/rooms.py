@@ -1,5 +1,6 @@
 """Rooms, halls and corridors, built around a motion so that nothing stands in its way."""
 
+import logging
 from collections.abc import Callable
 
 import numpy as np
@@ -7,8 +8,12 @@ import numpy as np
 from vioframe.checks import Array
 from vioframe.data.simulator import materials
 from vioframe.data.simulator.texture import Texture
-from vioframe.data.simulator.world import Skin, WorldPlan
+from vioframe.data.simulator.world import Skin, WorldPlan, swing
 
+log = logging.getLogger(__name__)
+
+PATH_STEP_S = 0.1
+"""Time between the points of the path that a place is built around."""
 CLEARANCE_M = 0.45
 """What furniture leaves free around the path of the body; walls leave more."""
 
@@ -20,7 +25,7 @@ class RoomBuilder:
 
     Args:
         rng: generator.
-        path: (N, 3) m, where the body goes.
+        path: (N, 3) m, where the body is every ``PATH_STEP_S``.
         low, high: (3,) m, corners of the room.
         texels_per_metre: resolution of walls.
         contrast: 1 for full texture, towards 0 for bare surfaces.
@@ -197,27 +202,40 @@ class RoomBuilder:
                 count -= 1
 
     def set_moving(self, count: int, speed: float = 0.8) -> None:
-        """Boxes, as large as people, that circle through the room; they may come close, never through the body."""
+        """Boxes, as large as people, that circle through the room and cross the path before and after the body."""
         rng = self._rng
-        for _ in range(60 * count):
-            if count <= 0:
+        elapsed = PATH_STEP_S * np.arange(len(self._path))
+        placed = 0
+        for attempt in range(200 * count):
+            if placed == count:
                 return
-            size = np.array([rng.uniform(0.35, 0.5), rng.uniform(0.35, 0.5), rng.uniform(1.2, 1.8)])
+            size = np.array([*rng.uniform(0.35, 0.5, 2), rng.uniform(1.2, 1.8)])
             size[2] = min(size[2], 0.9 * (self._high - self._low)[2])
-            swing = rng.uniform(0.2, 0.6, 2)
-            low = self._somewhere(size)
-            reach = np.array([*swing, 0.0])
-            if not self._is_free(low - reach, low + size + reach, among=False):
+            reach = np.array([*rng.uniform(0.3, 1.2, 2), 0.0])
+            room = self._high - self._low - size - 2.0 * reach
+            if room.min() <= 0.0:
                 continue
-            poster = int(rng.choice(self._posters))
-            width, height = self.plan.textures[poster].size_m
-            texture = self.plan.add_texture(
-                Texture(image=self.plan.textures[poster].image, size_m=(width, height))
-            )
-            self.plan.add_solid(low, low + size, [Skin(texture=texture, gain=g) for g in (0.9, 0.9, 1, 1, 0.5, 1.1)])
-            period_s = 2 * np.pi * float(swing.mean()) / speed
-            self.plan.moving.append((reach, period_s, float(rng.uniform(0, 2 * np.pi))))
-            count -= 1
+            low = self._low + reach + rng.uniform(0, 1, 3) * room
+            low[2] = self._low[2]
+            period_s, phase = 2.0 * np.pi * float(reach[:2].mean()) / speed, float(rng.uniform(0, 2.0 * np.pi))
+            at = low + swing(reach, period_s, phase, elapsed)
+            gap = np.maximum(np.maximum(at - self._path, self._path - at - size), 0.0)
+            if np.linalg.norm(gap, axis=1).min() < CLEARANCE_M:
+                continue
+            # Through furniture only where there is no other way.
+            swept = low - reach, low + size + reach
+            if attempt < 100 * count and any(
+                np.all(swept[0] < taken_high) and np.all(swept[1] > taken_low) for taken_low, taken_high in self._taken
+            ):
+                continue
+            picture = self.plan.textures[int(rng.choice(self._posters))]
+            extent = float(size[:2].max()), float(size[2])
+            coat = self.plan.add_texture(Texture(image=picture.image, size_m=extent))
+            self.plan.add_solid(low, low + size, [Skin(texture=coat, gain=g) for g in (0.9, 0.9, 1.0, 1.0, 0.5, 1.1)])
+            self.plan.moving.append((reach, period_s, phase))
+            placed += 1
+        if placed < count:
+            log.warning("dataset.degradations.moving_objects=%d: only %d find room to move here", count, placed)
 
     def _table(self, size: Array) -> bool:
         low = self._somewhere(size)

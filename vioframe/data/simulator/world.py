@@ -61,6 +61,13 @@ class WorldPlan:
         self.skins.extend(skins)
 
 
+def swing(amplitude: Array, period_s: float, phase: float, t_s: Array) -> Array:
+    """Offset (..., 3) m at times (...) of what moves: an ellipse in the plane, never at rest."""
+    angle = 2.0 * np.pi * t_s / period_s + phase
+    offset: Array = amplitude * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+    return offset
+
+
 class World:
     """Faces of all solids as arrays, ready to be drawn. Face ``6 s + 2 a + side`` is on solid s, normal to axis a.
 
@@ -110,9 +117,7 @@ class World:
             return
         first = len(self.low) - len(self._moving)
         for index, (amplitude, period_s, phase) in enumerate(self._moving):
-            angle = 2.0 * np.pi * t_s / period_s + phase
-            # Two axes a quarter turn apart: an ellipse, never at rest.
-            offset = amplitude * np.array([np.cos(angle), np.sin(angle), 0.0])
+            offset = swing(amplitude, period_s, phase, np.array(t_s))
             self.low[first + index] = self._rest_low[first + index] + offset
             self.high[first + index] = self._rest_high[first + index] + offset
         # Textures of moving solids go with them since they are fitted.
