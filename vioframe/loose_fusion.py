@@ -187,9 +187,9 @@ class StandstillOptions:
     gyro: float = 0.02
     accel: float = 0.15
     speed: float = 0.1
-    rotation_sigma: float = 3e-4
-    position_sigma: float = 1e-3
-    velocity_sigma: float = 0.02
+    rotation_sigma: float = 1e-4
+    position_sigma: float = 2e-4
+    velocity_sigma: float = 5e-3
 
     def __post_init__(self) -> None:
         _check_positive(
@@ -225,7 +225,7 @@ class StartOptions:
         accel_bias_sigma: m/s² an axis.
     """
 
-    rest_duration_s: float = 1.0
+    rest_duration_s: float = 0.75
     rest_gyro: float = 0.02
     rest_accel: float = 0.15
     rest_accel_bias_sigma: float = 0.1
