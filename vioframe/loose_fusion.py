@@ -187,7 +187,7 @@ class StandstillOptions:
     gyro: float = 0.02
     accel: float = 0.15
     speed: float = 0.1
-    rotation_sigma: float = 1e-4
+    rotation_sigma: float = 3e-4
     position_sigma: float = 2e-4
     velocity_sigma: float = 5e-3
 
