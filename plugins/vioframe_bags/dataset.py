@@ -1,48 +1,33 @@
 """``dataset=bag``: bags under a folder, each a sequence."""
 
-import array
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from vioframe.checks import Array, Stamps, check_pose
 from vioframe.conventions import GRAVITY, NANOSECONDS
+from vioframe.data import screening
 from vioframe.data.recording import Dataset, Finding
+from vioframe.data.selection import (
+    STEREO_TOLERANCE_NS,
+    FrameSelection,
+    as_names,
+    check_camera_count,
+    choose_frames,
+    match_stamps,
+    sample_span,
+)
 from vioframe.errors import ClockError, ConfigError, DataError, ShapeError
 from vioframe.geometry import se3
 from vioframe.types import ImuBlock, SensorRig, Trajectory
-from vioframe_bags import screening
 from vioframe_bags.bag import IMAGE, IMU, POSE, Bag
 from vioframe_bags.calibration import CalibratedCamera, CalibratedImu, read_cameras, read_imu
-from vioframe_bags.messages import image_of, imu_row, pose_of, poses_to_matrices
+from vioframe_bags.contents import Contents, collect
+from vioframe_bags.messages import image_of, poses_to_matrices
 from vioframe_bags.recording import BagRecording, check_size
 
-STEREO_TOLERANCE_NS = 1_000_000
-"""Two images belong together if their stamps are closer."""
-
-LEAD_NS = 2 * NANOSECONDS
-"""Inertial samples that are kept before the first frame."""
-
-
-@dataclass(slots=True)
-class _Contents:
-    """What one pass through the bag collects.
-
-    Attributes:
-        imu_stamps_ns, imu_rows: of all inertial samples; six numbers a row.
-        frame_stamps_ns: by camera, in the order of recording.
-        imu_before: by camera and image, the number of inertial samples recorded before it.
-        truth_stamps_ns, truth_rows: of all true poses; position and quaternion w, x, y, z.
-    """
-
-    imu_stamps_ns: "array.array[int]" = field(default_factory=lambda: array.array("q"))
-    imu_rows: "array.array[float]" = field(default_factory=lambda: array.array("d"))
-    frame_stamps_ns: "list[array.array[int]]" = field(default_factory=list)
-    imu_before: "list[array.array[int]]" = field(default_factory=list)
-    truth_stamps_ns: "array.array[int]" = field(default_factory=lambda: array.array("q"))
-    truth_rows: "array.array[float]" = field(default_factory=lambda: array.array("d"))
+_TRUTH_ADVICE = "check the calibration, dataset.T_body_truth and dataset.ground_truth_delay_s"
 
 
 class BagDataset(Dataset):
@@ -70,36 +55,25 @@ class BagDataset(Dataset):
         camera_delay_s: float | None = None,
         gravity: float = GRAVITY,
     ) -> None:
-        if cameras not in (1, 2):
-            raise ConfigError(f"dataset.cameras must be 1 or 2, got {cameras}")
         if not 8 <= mono16_bits <= 16:
             raise ConfigError(f"dataset.mono16_bits must be from 8 to 16, got {mono16_bits}")
-        if every < 1:
-            raise ConfigError(f"dataset.every must be 1 or more, got {every}")
-        if start_s < 0.0 or (duration_s is not None and duration_s <= 0.0):
-            raise ConfigError(
-                f"dataset.start_s must not be negative and dataset.duration_s must be positive or null, got {start_s} "
-                f"and {duration_s}"
-            )
         if not gravity > 0.0:
             raise ConfigError(f"dataset.gravity must be positive, got {gravity}")
+        self._camera_count = check_camera_count(cameras)
+        self._selection = FrameSelection(every=every, start_s=start_s, duration_s=duration_s)
         self._root = Path(root).expanduser()
         self._bags = find_bags(self._root)
-        self._names = self._choose(_as_list(sequence))
+        self._names = self._choose(as_names(sequence))
         self._imu_calibration = self._locate(imu_calibration)
-        self._camera_calibration = [self._locate(path) for path in _as_list(camera_calibration)]
+        self._camera_calibration = [self._locate(path) for path in as_names(camera_calibration)]
         self._imu_topic = imu_topic
-        self._camera_topics = _as_list(camera_topics)
+        self._camera_topics = as_names(camera_topics)
         self._truth_topic = ground_truth_topic
         self._T_truth_body = _invert(T_body_truth)
         self._truth_delay_ns = round(ground_truth_delay_s * NANOSECONDS)
         self._images = images
-        self._camera_count = cameras
         self._color = color
         self._mono16_bits = mono16_bits
-        self._every = every
-        self._start_s = start_s
-        self._duration_s = duration_s
         self._camera_delay_s = camera_delay_s
         self._gravity = gravity
 
@@ -119,18 +93,31 @@ class BagDataset(Dataset):
         findings = [_good("calibration", f"noise from {self._imu_calibration.name}; cameras: {len(calibrated)}")]
         bag = Bag(self._bags[sequence])
         imu_topic, topics = self._topics(bag, calibrated_imu, calibrated, findings)
-        contents = _collect(bag, imu_topic, topics, self._truth_topic)
-        imu = _imu_block(contents, f"{bag.path}: {imu_topic}")
+        contents = collect(bag, imu_topic, topics, self._truth_topic)
+        where = f"{bag.path}: {imu_topic}"
+        imu = contents.imu_block(where)
         noise = calibrated_imu.noise
-        findings += screening.check_imu(imu, noise.rate_hz, f"{bag.path}: {imu_topic}")
+        findings += screening.check_samples(imu, where, noise.rate_hz)
+        findings.append(screening.check_gaps(imu.stamps_ns, _longest_step_ns(imu)))
+        truth = self._truth(bag, contents, imu, findings)
+        if truth is not None:
+            findings += screening.check_with_truth(imu, truth, where, advice=_TRUTH_ADVICE)
         delay_ns = self._delay(calibrated, findings)
-        kept, covered_findings = self._frames(bag, topics, contents, imu, delay_ns)
-        findings += covered_findings
-        stamps_ns = [
-            np.array(stamps, dtype=np.int64)[rows] for stamps, rows in zip(contents.frame_stamps_ns, kept, strict=True)
-        ]
-        before = [np.array(counts)[rows] for counts, rows in zip(contents.imu_before, kept, strict=True)]
-        start, end = _span(imu, stamps_ns[0] + delay_ns)
+        all_stamps_ns = contents.image_stamps(topics, str(bag.path))
+        pairs = _pair(bag, topics, all_stamps_ns, findings)
+        kept, found = choose_frames(
+            all_stamps_ns[0][pairs[0]],
+            imu,
+            self._selection,
+            delay_ns=delay_ns,
+            where=f"{bag.path}: {topics[0]}",
+            truth=truth,
+        )
+        findings += found
+        rows = [one[kept] for one in pairs]
+        stamps_ns = [stamps[chosen] for stamps, chosen in zip(all_stamps_ns, rows, strict=True)]
+        before = [np.array(counts)[chosen] for counts, chosen in zip(contents.imu_before, rows, strict=True)]
+        start, end = sample_span(imu, stamps_ns[0] + delay_ns)
         rig = SensorRig(
             cameras=tuple(one.camera for one in calibrated[: len(topics)]),
             imu=noise,
@@ -144,11 +131,11 @@ class BagDataset(Dataset):
             name=sequence,
             bag=bag,
             rig=rig,
-            imu=ImuBlock(stamps_ns=imu.stamps_ns[start:end], gyro=imu.gyro[start:end], accel=imu.accel[start:end]),
+            imu=imu.cut(start, end),
             topics=topics,
             stamps_ns=stamps_ns,
             arrived=np.clip(np.max(before, axis=0) - start, 0, end - start),
-            truth=self._truth(bag, contents, imu, findings),
+            truth=truth,
             findings=findings,
             color=self._color,
             mono16_bits=self._mono16_bits,
@@ -210,39 +197,6 @@ class BagDataset(Dataset):
             findings.append(_good("camera delay", f"{delay_ns / 1e6:.3f} ms, from the calibration"))
         return delay_ns or 0
 
-    def _frames(
-        self, bag: Bag, topics: list[str], contents: _Contents, imu: ImuBlock, delay_ns: int
-    ) -> tuple[list[np.ndarray], list[Finding]]:
-        """By camera the images that make the frames to stream."""
-        all_stamps = [np.array(stamps, dtype=np.int64) for stamps in contents.frame_stamps_ns]
-        for topic, stamps in zip(topics, all_stamps, strict=True):
-            screening.check_order(stamps, f"{bag.path}: {topic}")
-        findings = []
-        rows = [np.arange(len(all_stamps[0]))]
-        if len(topics) == 2:
-            rows = list(match_stamps(all_stamps[0], all_stamps[1]))
-            unmatched = len(all_stamps[0]) - len(rows[0])
-            if not len(rows[0]):
-                raise ClockError(
-                    f"{bag.path}: no image of {topics[1]} is within {STEREO_TOLERANCE_NS / 1e6:g} ms of one of "
-                    f"{topics[0]}: the two cameras do not form pairs; set rig=mono"
-                )
-            if unmatched:
-                text = f"{unmatched} of {len(all_stamps[0])} images of {topics[0]} have no partner and are left out"
-                findings.append(Finding(level="note", subject="stereo pairs", text=text))
-        where = f"{bag.path}: {topics[0]}"
-        stamps_ns = all_stamps[0][rows[0]]
-        covered, clock_findings = screening.check_frames(stamps_ns, imu, delay_ns, where)
-        begin = int(stamps_ns[covered][0]) + round(self._start_s * NANOSECONDS)
-        end = int(stamps_ns[-1]) if self._duration_s is None else begin + round(self._duration_s * NANOSECONDS)
-        kept = np.flatnonzero(covered & (stamps_ns >= begin) & (stamps_ns <= end))[:: self._every]
-        if len(kept) < 2:
-            raise DataError(
-                f"{where}: {len(kept)} of {len(stamps_ns)} frames are left by dataset.start_s={self._start_s:g}, "
-                f"duration_s={self._duration_s} and every={self._every}, but two are needed: change them"
-            )
-        return [one[kept] for one in rows], findings + clock_findings
-
     def _check_first_images(self, bag: Bag, topics: list[str], rig: SensorRig, findings: list[Finding]) -> None:
         """Decode images of each camera until one is right; refuse an encoding or a size that will never be."""
         for topic, camera in zip(topics, rig.cameras, strict=True):
@@ -263,7 +217,7 @@ class BagDataset(Dataset):
             size = camera.size_px
             findings.append(_good("images", f"{topic}: {size[0]}×{size[1]} px, as calibrated"))
 
-    def _truth(self, bag: Bag, contents: _Contents, imu: ImuBlock, findings: list[Finding]) -> Trajectory | None:
+    def _truth(self, bag: Bag, contents: Contents, imu: ImuBlock, findings: list[Finding]) -> Trajectory | None:
         if self._truth_topic is None:
             text = "dataset.ground_truth_topic is not set: errors cannot be told"
             findings.append(Finding(level="note", subject="ground truth", text=text))
@@ -290,7 +244,7 @@ class BagDataset(Dataset):
                 f"the IMU ({int(imu.stamps_ns[0])} to {int(imu.stamps_ns[-1])} ns): set dataset.ground_truth_delay_s, "
                 "or dataset.ground_truth_topic=null"
             )
-        findings.append(_good("ground truth", f"{len(stamps_ns)} poses from {self._truth_topic}"))
+        findings.append(_good("ground truth topic", self._truth_topic))
         return Trajectory(stamps_ns=stamps_ns, T_world_body=poses)
 
 
@@ -298,10 +252,30 @@ def _good(subject: str, text: str) -> Finding:
     return Finding(level="good", subject=subject, text=text)
 
 
-def _as_list(value: str | Sequence[str] | None) -> list[str]:
-    if value is None:
-        return []
-    return [value] if isinstance(value, str) else [str(one) for one in value]
+def _longest_step_ns(imu: ImuBlock) -> int:
+    """A longer step is a hole: drivers jitter, by up to a period where the computer is busy."""
+    return round(3.0 * float(np.median(np.diff(imu.stamps_ns))))
+
+
+def _pair(bag: Bag, topics: list[str], stamps_ns: list[Stamps], findings: list[Finding]) -> list[Stamps]:
+    """By camera the images (F,) that belong together.
+
+    Raises:
+        ClockError: none do.
+    """
+    if len(topics) == 1:
+        return [np.arange(len(stamps_ns[0]))]
+    left, right = match_stamps(*stamps_ns)
+    unmatched = len(stamps_ns[0]) - len(left)
+    if not len(left):
+        raise ClockError(
+            f"{bag.path}: no image of {topics[1]} is within {STEREO_TOLERANCE_NS / 1e6:g} ms of one of {topics[0]}: "
+            "the two cameras do not form pairs; set rig=mono"
+        )
+    if unmatched:
+        text = f"{unmatched} of {len(stamps_ns[0])} images of {topics[0]} have no partner and are left out"
+        findings.append(Finding(level="note", subject="stereo pairs", text=text))
+    return [left, right]
 
 
 def _invert(T_body_truth: Sequence[Sequence[float]] | None) -> Array:
@@ -349,55 +323,3 @@ def _is_bag(path: Path) -> bool:
     if path.is_dir():
         return (path / "metadata.yaml").exists()
     return path.suffix in (".bag", ".mcap", ".db3")
-
-
-def _collect(bag: Bag, imu_topic: str, topics: list[str], truth_topic: str | None) -> _Contents:
-    """Read the bag through once; images are passed over but for their stamps."""
-    contents = _Contents(
-        frame_stamps_ns=[array.array("q") for _ in topics], imu_before=[array.array("q") for _ in topics]
-    )
-    cameras = {topic: index for index, topic in enumerate(topics)}
-    for message in bag.read({imu_topic, *topics} | ({truth_topic} if truth_topic else set())):
-        if message.topic == imu_topic:
-            contents.imu_stamps_ns.append(message.stamp_ns)
-            contents.imu_rows.extend(imu_row(message.decode()))
-        elif message.topic in cameras:
-            camera = cameras[message.topic]
-            contents.frame_stamps_ns[camera].append(message.stamp_ns)
-            contents.imu_before[camera].append(len(contents.imu_stamps_ns))
-        else:
-            position, quat_wxyz = pose_of(message.decode())
-            contents.truth_stamps_ns.append(message.stamp_ns)
-            contents.truth_rows.extend((*position, *quat_wxyz))
-    return contents
-
-
-def _imu_block(contents: _Contents, where: str) -> ImuBlock:
-    stamps_ns = np.array(contents.imu_stamps_ns, dtype=np.int64)
-    values = np.array(contents.imu_rows).reshape(-1, 6)
-    if len(stamps_ns) < 10:
-        raise DataError(f"{where}: {len(stamps_ns)} samples are too few for a recording: record the bag again")
-    screening.check_order(stamps_ns, where)
-    bad = ~np.isfinite(values).all(axis=1)
-    if bad.any():
-        raise DataError(
-            f"{where}: the sample at stamp {int(stamps_ns[np.argmax(bad)])} is not finite ({int(bad.sum())} such "
-            "samples): filter them out of the bag"
-        )
-    return ImuBlock(stamps_ns=stamps_ns, gyro=values[:, :3].copy(), accel=values[:, 3:].copy())
-
-
-def _span(imu: ImuBlock, arrivals_ns: Stamps) -> tuple[int, int]:
-    """Range of the samples from :data:`LEAD_NS` before the first frame to just after the last."""
-    start = int(np.searchsorted(imu.stamps_ns, arrivals_ns[0] - LEAD_NS))
-    end = int(np.searchsorted(imu.stamps_ns, arrivals_ns[-1], side="left")) + 1
-    return start, min(end, len(imu))
-
-
-def match_stamps(left_ns: Stamps, right_ns: Stamps) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the pairs closer than :data:`STEREO_TOLERANCE_NS`, both increasing."""
-    after = np.clip(np.searchsorted(right_ns, left_ns), 0, len(right_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.where(np.abs(right_ns[after] - left_ns) < np.abs(left_ns - right_ns[before]), after, before)
-    close = np.abs(right_ns[nearest] - left_ns) <= STEREO_TOLERANCE_NS
-    return np.flatnonzero(close), nearest[close]

@@ -1,13 +1,13 @@
 """One bag as a recording: samples in memory, images decoded one at a time."""
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from vioframe.checks import Stamps
-from vioframe.conventions import seconds
-from vioframe.data.recording import Finding, Recording
+from vioframe.data.checked import CheckedRecording, size_mismatch
+from vioframe.data.recording import Finding
 from vioframe.errors import DataError
 from vioframe.types import Camera, Frame, Image, ImuBlock, Packet, SensorRig, Trajectory
 from vioframe_bags.bag import Bag
@@ -15,19 +15,11 @@ from vioframe_bags.messages import image_of
 
 log = logging.getLogger(__name__)
 
-BLOCK_NS = 50_000_000
-"""Longest inertial block that is handed on at once."""
 
-
-class BagRecording(Recording):
-    """A bag that has been read once and checked.
+class BagRecording(CheckedRecording):
+    """A bag that has been read once and checked; images are decoded as they come by.
 
     Packets come in the order of recording: before each frame the inertial samples that were recorded before it.
-
-    Attributes:
-        name: of the sequence.
-        imu: all samples that are streamed.
-        frame_stamps_ns: (F,) stamps of camera 0.
 
     Args:
         name: of the sequence.
@@ -52,52 +44,19 @@ class BagRecording(Recording):
         imu: ImuBlock,
         topics: Sequence[str],
         stamps_ns: Sequence[Stamps],
-        arrived: np.ndarray,
+        arrived: Stamps,
         truth: Trajectory | None,
         findings: Sequence[Finding],
         color: bool = False,
         mono16_bits: int = 16,
     ) -> None:
-        self.name = name
-        self.imu = imu
-        self.frame_stamps_ns = stamps_ns[0]
+        super().__init__(name=name, rig=rig, imu=imu, frame_stamps_ns=stamps_ns[0], truth=truth, findings=findings)
         self._bag = bag
-        self._rig = rig
         self._topics = list(topics)
         self._stamps_ns = list(stamps_ns)
         self._arrived = arrived
-        self._truth = truth
-        self._findings = list(findings)
         self._color = color
         self._mono16_bits = mono16_bits
-        self._corrupt = 0
-
-    @property
-    def rig(self) -> SensorRig:
-        """Calibration."""
-        return self._rig
-
-    @property
-    def frame_count(self) -> int:
-        """Number of frames; corrupt ones, which are only met on the way, are counted here."""
-        return len(self.frame_stamps_ns)
-
-    @property
-    def duration_s(self) -> float:
-        """Seconds from the first to the last frame."""
-        return seconds(int(self.frame_stamps_ns[-1] - self.frame_stamps_ns[0]))
-
-    def ground_truth(self) -> Trajectory | None:
-        """True poses of the body, or None."""
-        return self._truth
-
-    def findings(self) -> list[Finding]:
-        """What the checks on opening found."""
-        return list(self._findings)
-
-    def counters(self) -> Mapping[str, int]:
-        """Images that could not be decoded since :meth:`packets` began."""
-        return {"corrupt images": self._corrupt} if self._corrupt else {}
 
     def packets(self) -> Iterator[Packet]:
         """Stream from the start; no more images are held than the cameras are apart in the bag."""
@@ -110,15 +69,6 @@ class BagRecording(Recording):
             if images is not None:
                 yield Frame(stamp_ns=int(self.frame_stamps_ns[index]), images=images)
         yield from self._blocks(done, len(self.imu))
-
-    def _blocks(self, start: int, end: int) -> Iterator[ImuBlock]:
-        stamps_ns = self.imu.stamps_ns
-        while start < end:
-            stop = min(max(int(np.searchsorted(stamps_ns, stamps_ns[start] + BLOCK_NS)), start + 1), end)
-            yield ImuBlock(
-                stamps_ns=stamps_ns[start:stop], gyro=self.imu.gyro[start:stop], accel=self.imu.accel[start:stop]
-            )
-            start = stop
 
     def _frames(self) -> Iterator[tuple[int, tuple[Image, ...] | None]]:
         """Index and images of each frame in order; None instead of the images where one is corrupt."""
@@ -162,9 +112,7 @@ def check_size(image: Image, camera: Camera) -> Image:
     Raises:
         DataError: its size is not that of the calibration.
     """
-    height, width = image.shape[:2]
-    if (width, height) != tuple(camera.size_px):
-        raise DataError(
-            f"the image is {width}×{height} px, but the calibration says {camera.size_px[0]}×{camera.size_px[1]}"
-        )
+    wrong = size_mismatch(image, camera)
+    if wrong:
+        raise DataError(wrong)
     return image

@@ -221,9 +221,7 @@ class AslDataset(PartedDataset):
             findings.append(_note("ground truth choice", text))
         return replace(truth, T_world_body=truth.T_world_body @ T_sensor_imu)
 
-    def _frames(
-        self, folder: Path, count: int, findings: list[Finding]
-    ) -> tuple[Stamps, list[list[Path]], Path, int]:
+    def _frames(self, folder: Path, count: int, findings: list[Finding]) -> tuple[Stamps, list[list[Path]], Path, int]:
         """Stamps (F,), files by camera, the file of the stamps, and how many frames lack a file."""
         stamps_ns, files, source = read_frame_list(folder / "cam0", images=self.images)
         if not self.images:

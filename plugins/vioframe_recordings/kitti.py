@@ -169,9 +169,7 @@ class KittiDataset(Dataset):
         first = 2 if self.color else 0
         return [folder / f"image_{first + index}" for index in range(self.camera_count)]
 
-    def _available(
-        self, folder: Path, count: int, findings: list[Finding]
-    ) -> tuple[Mask, list[list[Path]], int]:
+    def _available(self, folder: Path, count: int, findings: list[Finding]) -> tuple[Mask, list[list[Path]], int]:
         """Which frames have all their images, the files by camera, and how many are missing in between."""
         if not self.images:
             return np.ones(count, dtype=bool), [], 0

@@ -140,9 +140,7 @@ def poses_of_oxts(values: Array) -> Array:
     """
     latitude, longitude = np.radians(values[:, 0]), np.radians(values[:, 1])
     scale = np.cos(latitude[0]) * EARTH_RADIUS
-    position = np.stack(
-        [scale * longitude, scale * np.log(np.tan(np.pi / 4 + latitude / 2)), values[:, 2]], axis=1
-    )
+    position = np.stack([scale * longitude, scale * np.log(np.tan(np.pi / 4 + latitude / 2)), values[:, 2]], axis=1)
     axes = np.eye(3)
     roll, pitch, yaw = (so3.exp(values[:, 3 + axis, None] * axes[axis]) for axis in range(3))
     return se3.from_parts(yaw @ pitch @ roll, position - position[0])

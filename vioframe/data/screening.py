@@ -55,9 +55,7 @@ def check_samples(imu: ImuBlock, where: str, rate_hz: float) -> list[Finding]:
                 "the accelerometer reads one constant vector, as at rest, so these look like degrees per second: "
                 "convert them to rad/s"
             )
-    findings.append(
-        Finding(level="good", subject="gyro unit", text=f"rad/s: the fastest rate is {fastest:.2f} rad/s")
-    )
+    findings.append(Finding(level="good", subject="gyro unit", text=f"rad/s: the fastest rate is {fastest:.2f} rad/s"))
     magnitude = float(np.median(np.linalg.norm(imu.accel, axis=1)))
     if not ACCEL_RANGE[0] <= magnitude <= ACCEL_RANGE[1]:
         guess = (
@@ -72,9 +70,7 @@ def check_samples(imu: ImuBlock, where: str, rate_hz: float) -> list[Finding]:
             f"9.81 m/s² for a body that comes back to where it was; {guess}"
         )
     findings.append(
-        Finding(
-            level="good", subject="accelerometer unit", text=f"m/s²: the median magnitude is {magnitude:.2f} m/s²"
-        )
+        Finding(level="good", subject="accelerometer unit", text=f"m/s²: the median magnitude is {magnitude:.2f} m/s²")
     )
     if quiet is not None:
         at_rest = float(np.linalg.norm(imu.accel[quiet[0] : quiet[1]].mean(axis=0)))
@@ -359,19 +355,18 @@ def _check_force(imu: ImuBlock, truth: Trajectory, where: str, advice: str) -> l
 def mean_specific_force(imu: ImuBlock, truth: Trajectory) -> tuple[Array, int]:
     """Mean specific force (3,) m/s² in the world over the samples that the truth covers, and their number.
 
-    The mean acceleration of the body is taken out where the truth has velocities; over a long
-    recording it vanishes, over a second it does not.
+    The mean acceleration of the body is taken out; over a long recording it vanishes, over a second it does not.
     """
     kept = np.arange(0, len(imu), max(len(imu) // 5000, 1))
     T, covered = interpolate_poses(truth, imu.stamps_ns[kept], max_gap_ns=200_000_000)
     if not covered.any():
         return np.zeros(3), 0
     force = (T[covered, :3, :3] @ imu.accel[kept][covered, :, None])[..., 0].mean(axis=0)
-    if truth.v_world_body is not None:
-        inside = (truth.stamps_ns >= imu.stamps_ns[0]) & (truth.stamps_ns <= imu.stamps_ns[-1])
-        velocity, stamps_ns = truth.v_world_body[inside], truth.stamps_ns[inside]
-        if len(velocity) > 1:
-            force = force - (velocity[-1] - velocity[0]) / seconds(int(stamps_ns[-1] - stamps_ns[0]))
+    inside = (truth.stamps_ns >= imu.stamps_ns[0]) & (truth.stamps_ns <= imu.stamps_ns[-1])
+    known = truth.v_world_body if truth.v_world_body is not None else differentiate_positions(truth)
+    velocity, stamps_ns = known[inside], truth.stamps_ns[inside]
+    if len(velocity) > 1:
+        force = force - (velocity[-1] - velocity[0]) / seconds(int(stamps_ns[-1] - stamps_ns[0]))
     return force, int(covered.sum())
 
 
