@@ -14,6 +14,8 @@ from vioframe.errors import ConfigError, DataError
 SEEDS_PER_SPLIT = 10_000
 """Seeds of a split; ``test`` has the first ten thousand, then ``validation``, then ``train``."""
 
+# The motion goes on after the last stamp: for the last rows of a rolling shutter, and the sample that follows.
+_AFTERWARDS_S = 1.0
 _SPLITS = ("test", "validation", "train")
 
 
@@ -93,7 +95,7 @@ class SimulatedDataset(Dataset):
         standstill_s = traits.standstill_s if self._standstill_s is None else float(self._standstill_s)
         return SimulatedRecording(
             name=sequence,
-            plan=plan_motion(family, seed, duration_s, standstill_s),
+            plan=plan_motion(family, seed, duration_s + _AFTERWARDS_S, standstill_s),
             seed=seed,
             duration_s=duration_s,
             kit=traits.kit,
