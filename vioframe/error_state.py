@@ -346,6 +346,10 @@ class NoiseAdaptation:
         step = np.minimum(squares / 3.0, self._CAP) - self._TARGET
         self._logs = np.clip(self._logs + duration_s / self._time_s * step, 0.0, self._most)
 
+    def believe_translation(self) -> None:
+        """Take the odometry's translation at its word again."""
+        self._logs[1] = 0.0
+
 
 class InertialFilter:
     """Body, covariance and the two steps of a Kalman filter; a plugin appends its own errors.

@@ -35,6 +35,8 @@ from vioframe.types import (
     SyncedWindow,
 )
 
+# Beyond this factor on its translational noise the odometry is as good as refused.
+_HARDLY_BELIEVED = 8.0
 # Rounding turns a rotation off the group by about 1e-16 a window.
 _NORMALISE_EVERY = 1000
 
@@ -114,7 +116,7 @@ class VisualOptions:
         gate_probability: a relative pose is used if its χ² is one that a true one stays below with this
             probability; 1 uses all.
         lost_after_s: seconds without a used one, moving, after which the status is ``lost``.
-        recover_after_s: seconds of refusing all of them after which the filter doubts itself instead.
+        recover_after_s: seconds of refusing or hardly believing all of them after which the filter doubts itself.
         recover_tilt_sigma: rad, what is then added to roll and pitch.
         recover_velocity_sigma: m/s, what is then added to the velocity.
     """
@@ -386,7 +388,7 @@ class LooseFuser(Fuser):
         self._windows += 1
         if self._windows % _NORMALISE_EVERY == 0:
             self._filter.normalise()
-        states.append(self._emit(self._status()))
+        states.append(self._emit())
         return states
 
     def _begin(self, state: NavState, covariance: Array, stamp_ns: int) -> NavState:
@@ -394,7 +396,7 @@ class LooseFuser(Fuser):
         self._begun = True
         self._stamp_ns = self._supported_ns = stamp_ns
         self._started()
-        return self._emit(self._status())
+        return self._emit()
 
     def _prepare(self, measurement: Measurement) -> Step:
         window, pose = measurement.window, measurement.relative_pose
@@ -443,15 +445,17 @@ class LooseFuser(Fuser):
         return True
 
     def _account(self, step: Step, supported: bool) -> None:
-        """Keep count of how long measurements have been missing or refused."""
+        """Keep count of how long measurements have been missing, refused or hardly believed."""
         if supported:
             self._supported_ns = step.current_ns
-            self._refused_s = 0.0
-        elif step.motion is not None:
+        if step.motion is not None and (not supported or self._adapted.translation > _HARDLY_BELIEVED):
             self._refused_s += step.delta.duration_s
+        elif supported:
+            self._refused_s = 0.0
         if self._refused_s > self._visual.recover_after_s:
             # Odometry that disagrees all the time is more likely right than a filter that never looks.
             self._filter.doubt(self._visual.recover_tilt_sigma, self._visual.recover_velocity_sigma)
+            self._adapted.believe_translation()
             self._count("recoveries")
             self._refused_s = 0.0
 
@@ -462,8 +466,8 @@ class LooseFuser(Fuser):
         elapsed = seconds(self._stamp_ns - self._supported_ns)
         return "lost" if elapsed > self._visual.lost_after_s else "tracking"
 
-    def _emit(self, status: Status) -> NavState:
-        return self._filter.nav_state(self._stamp_ns, status)
+    def _emit(self) -> NavState:
+        return self._filter.nav_state(self._stamp_ns, self._status())
 
     def _new_filter(self) -> InertialFilter:
         """A filter with the errors that the plugin appends."""

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from vioframe.checks import Array
-from vioframe.error_state import part_of
+from vioframe.error_state import INERTIAL, VELOCITY, part_of
 from vioframe.errors import ConfigError
 from vioframe.interfaces import CONSISTENT_SCALE, INERTIAL_DELTA, RELATIVE_POSE
 from vioframe.loose_fusion import (
@@ -18,7 +18,7 @@ from vioframe.loose_fusion import (
     VisualMotion,
     VisualOptions,
 )
-from vioframe.types import InertialDelta, NavState, Status
+from vioframe.types import InertialDelta, NavState
 from vioframe_msf.search import ScaleSearch
 from vioframe_msf.state import ScaledFilter
 
@@ -35,6 +35,8 @@ class ScaleOptions:
         known_sigma: relative standard deviation at which the scale counts as known.
         known_probability: of one answer against all others, at which it counts as known.
         walk: 1/√s, drift of its logarithm.
+        velocity_sigma: m/s; until the scale is known the status is ``starting`` unless the velocity is known,
+            from a rest or a given state, to this.
         kept_by_vo: the VO keeps its unit through an interruption; if not, it is searched again after each.
     """
 
@@ -43,6 +45,7 @@ class ScaleOptions:
     known_sigma: float = 0.1
     known_probability: float = 0.99
     walk: float = 0.01
+    velocity_sigma: float = 0.2
     kept_by_vo: bool = True
 
     def __post_init__(self) -> None:
@@ -53,8 +56,9 @@ class ScaleOptions:
             raise ConfigError(f"fuser.scale.ratio must be at least 1, got {self.ratio}")
         if not 0.0 < self.known_probability < 1.0:
             raise ConfigError(f"fuser.scale.known_probability must be in (0, 1), got {self.known_probability}")
-        if not self.walk >= 0.0:
-            raise ConfigError(f"fuser.scale.walk must not be negative, got {self.walk}")
+        for name in ("walk", "velocity_sigma"):
+            if not getattr(self, name) >= 0.0:
+                raise ConfigError(f"fuser.scale.{name} must not be negative, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -186,16 +190,20 @@ class MsfFuser(LooseFuser):
         self._search: ScaleSearch | None = None
         self._look_for_scale(self._scale.guess)
 
-    def _status(self) -> Status:
-        return super()._status() if self._was_known else "starting"
-
-    def _emit(self, status: Status) -> NavState:
-        if not self._pending:
-            return super()._emit(status)
-        ahead = self._filter.copy()
+    def _emit(self) -> NavState:
+        ahead = self._filter
+        if self._search is not None or self._pending:
+            ahead = self._filter.copy()
+        if self._search is not None:
+            ahead.body, ahead.covariance[INERTIAL, INERTIAL] = self._search.summary()
         for delta in self._pending:
             ahead.propagate(delta)
-        return ahead.nav_state(self._stamp_ns, status)
+        state = ahead.nav_state(self._stamp_ns, self._status())
+        if self._was_known or state.covariance is None:
+            return state
+        # Body and scale start apart: from a rest the body is known long before the unit of the VO.
+        velocity_sigma = float(np.sqrt(np.diag(state.covariance)[VELOCITY].max()))
+        return state if velocity_sigma <= self._scale.velocity_sigma else replace(state, status="starting")
 
     def _advance(self, step: Step) -> bool:
         late = self._delayed(step)

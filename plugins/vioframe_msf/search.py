@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vioframe.checks import Array
+from vioframe.error_state import INERTIAL, Body, difference, retract
 from vioframe_msf.state import ScaledFilter
 
 # Spacing of the log scales and standard deviation of each: the sum of such Gaussians is flat to 1 %.
@@ -51,6 +53,19 @@ class ScaleSearch:
     def best(self) -> ScaledFilter:
         """The filter with the largest weight."""
         return max(self.hypotheses, key=lambda hypothesis: hypothesis.log_weight).state
+
+    def summary(self) -> tuple[Body, Array]:
+        """Mean and covariance (15, 15), right-invariant, of what all hypotheses together say of the body."""
+        weights = np.exp([hypothesis.log_weight for hypothesis in self.hypotheses])
+        weights /= weights.sum()
+        best = self.best.body
+        offsets = np.array([difference(best, hypothesis.state.body) for hypothesis in self.hypotheses])
+        mean = weights @ offsets
+        spread = offsets - mean
+        covariance = np.einsum("n,ni,nj->ij", weights, spread, spread)
+        for weight, hypothesis in zip(weights, self.hypotheses, strict=True):
+            covariance += weight * hypothesis.state.covariance[INERTIAL, INERTIAL]
+        return retract(best, mean), covariance
 
     def reduce(self) -> None:
         """Drop the hopeless, merge those that have come to say the same."""

@@ -178,13 +178,16 @@ def test_an_outlier_is_gated(walk):
     assert out.position_errors()[-1] < clean.position_errors()[-1] + 0.1
 
 
-def test_recovers_from_a_wrong_velocity(walk):
-    """Sure of a velocity that is 3 m/s off, it refuses everything, then doubts itself and follows again."""
+@pytest.mark.parametrize("adapt_most", [1.0, 30.0], ids=["stated noise", "adapted noise"])
+def test_recovers_from_a_wrong_velocity(walk, adapt_most):
+    """Sure of a velocity that is 3 m/s off, it refuses everything at first, then follows again."""
     recording, run = walk
     start = run.true_state(run.measurements[60].window.previous.stamp_ns)
     start = replace(start, v_world_body=start.v_world_body + 3.0)
     rest = replace(run, measurements=run.measurements[60:])
-    out = play(EkfFuser(), recording, rest, initial=start)
+    out = play(EkfFuser(inertial=InertialOptions(adapt_most=adapt_most)), recording, rest, initial=start)
+    assert_honest(out.states)
+    assert out.counters["gated VO updates"] >= 3
     assert out.counters["recoveries"] >= 1
     assert out.states[-1].status == "tracking"
     error = out.states[-1].v_world_body - run.true_state(out.states[-1].stamp_ns).v_world_body
