@@ -56,7 +56,7 @@ def run(config: DictConfig) -> int:
     experiment = _Experiment(config, folder, options, pipeline, dataset, tracker, viewer, choices)
     with _terminate_like_interrupt(), tracker:
         tracker.start(parameters, tags, name=_run_name(pipeline, choices))
-        status = experiment.run(progress=bool(config.progress) and hydra_config.mode != RunMode.MULTIRUN)
+        status = experiment.run(in_sweep=hydra_config.mode == RunMode.MULTIRUN)
         if status == INTERRUPTED:
             tracker.finish("killed", "interrupted by the user")
         elif status:
@@ -105,8 +105,9 @@ class _Experiment:
         """One sentence for each sequence that did not finish."""
         return [f"{run.sequence}: {run.error}" for run in self.runs if run.error is not None]
 
-    def run(self, *, progress: bool) -> int:
+    def run(self, *, in_sweep: bool) -> int:
         """Run all sequences; write, print and log what came out, also when it is not all."""
+        progress = bool(self.config.progress) and not in_sweep
         for name in self.dataset.sequences:
             try:
                 recording = self.dataset.open(name)
@@ -117,6 +118,11 @@ class _Experiment:
             if self._run_one(recording, progress=progress):
                 break
         self._finish()
+        if in_sweep:
+            log.info("%s", self.folder)
+        else:
+            hints = [self.tracker.hint, "" if self.viewer is None else self.viewer.hint]
+            print_rows(self.rows, self.folder, hint="\n".join(hint for hint in hints if hint))
         if self._bug is not None:
             raise self._bug
         if any(run.interrupted for run in self.runs):
@@ -183,8 +189,6 @@ class _Experiment:
             self.tracker.log_file(path, path.parent.relative_to(self.folder).as_posix().removeprefix("."))
         if (self.folder / "plots").is_dir():
             self.tracker.log_folder(self.folder / "plots", "plots")
-        hints = [self.tracker.hint, "" if self.viewer is None else self.viewer.hint]
-        print_rows(self.rows, self.folder, hint="\n".join(hint for hint in hints if hint))
 
 
 def _unopened(name: str, error: str) -> SequenceRun:
