@@ -1,7 +1,7 @@
 """A small bundle adjustment: some keyframes, their landmarks, dense arrays, Schur complement.
 
-Observations fill a grid (K keyframes × M points) with holes. Levenberg–Marquardt on the Cauchy cost; the points, which are
-3×3 blocks, are eliminated first (Triggs et al. 2000, section 6), which leaves a system of the free poses.
+Observations fill a grid (K keyframes × M points) with holes. Levenberg–Marquardt on the Cauchy cost; the points,
+which are 3×3 blocks, are eliminated first (Triggs et al. 2000, section 6), which leaves a system of the free poses.
 """
 
 from dataclasses import dataclass
@@ -92,7 +92,7 @@ def adjust(problem: BundleProblem, *, iterations: int = 6, robust_scale: float =
     """Run Levenberg–Marquardt; the result is never worse than the start."""
     T, q = problem.T_map_cam, problem.q
     free = np.flatnonzero(problem.free)
-    views, count = problem.seen.shape
+    count = problem.seen.shape[1]
     observations = max(int(problem.seen.sum()), 1)
     damping = 1e-4
     best_cost = cost_before = np.inf
@@ -139,11 +139,7 @@ def adjust(problem: BundleProblem, *, iterations: int = 6, robust_scale: float =
         q = q0 + step_q
         q[:, 2] = np.maximum(q[:, 2], problem.min_inverse_depth)
     if state is None:
-        zero = np.zeros((count, 3, 3))
-        return BundleResult(
-            T_map_cam=problem.T_map_cam, q=problem.q, q_covariance=zero, pose_covariance=np.zeros((0, 0)),
-            errors=np.full((views, count), np.inf), cost_before=np.inf, cost=np.inf,
-        )
+        raise ValueError("iterations must be at least 1")
     T, q, Hcc, Hcq, Hqq, bc, bq, errors = state
     _, _, V, schur_inverse = _solve(Hcc, Hcq, Hqq, bc, bq, 1e-9)
     VW = V[None] @ np.swapaxes(Hcq, -1, -2)

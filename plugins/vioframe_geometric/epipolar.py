@@ -1,6 +1,6 @@
 """Relative pose of two views up to the length of the translation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -8,16 +8,20 @@ import numpy as np
 from vioframe.checks import Array
 from vioframe.geometry import so3
 from vioframe.geometry.triangulation import triangulate
+from vioframe.types import Camera
 from vioframe_geometric.pose import cauchy_weights
 from vioframe_geometric.rays import distortion_slope
-from vioframe.types import Camera
 
 _ITERATIONS = 12
 _ROBUST = 2.0
 _DIRECTIONS = 150
-_STARTS = 3
+_STARTS = 4
+_SHORT = 8
 _APART = 0.92
 _MIN_AHEAD = 0.5
+_SAME_COST = 1.0
+_AS_GOOD = 0.95
+_OTHER_DIRECTION = 0.97
 _SHIFT = 1e-6
 
 
@@ -32,6 +36,7 @@ class TwoViewFit:
         tangents: (3, 2) orthonormal, orthogonal to t.
         errors: (M,) Sampson distances over σ.
         cost: mean robust cost.
+        ambiguous: another direction fits as well (points on one plane).
     """
 
     R_prev_cur: Array
@@ -40,11 +45,12 @@ class TwoViewFit:
     tangents: Array
     errors: Array
     cost: float
+    ambiguous: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Pairs:
-    """Points seen twice: homogeneous normalised coordinates (M, 3) and ∂(normalised)/∂(pixel) (M, 2, 2) in each view."""
+    """Points seen twice: homogeneous normalised coordinates (M, 3), and ∂(normalised)/∂(pixel) (M, 2, 2), in each."""
 
     prev: Array
     cur: Array
@@ -92,16 +98,18 @@ def fit_two_view(pairs: Pairs, *, focal_px: float, sigma_px: float, threshold_px
     starts += _search_directions(pairs, R_only, sigma_px)
     fits = []
     for R, t in starts:
-        fit = _refine(pairs, R, t / np.linalg.norm(t), sigma_px, iterations=6)
-        if max(_ahead(pairs, fit.R_prev_cur, fit.t), _ahead(pairs, fit.R_prev_cur, -fit.t)) >= _MIN_AHEAD:
-            fits.append(fit)
+        fit = _refine(pairs, R, t / np.linalg.norm(t), sigma_px, iterations=_SHORT)
+        one, other = _ahead(pairs, fit.R_prev_cur, fit.t), _ahead(pairs, fit.R_prev_cur, -fit.t)
+        if max(one, other) >= _MIN_AHEAD:
+            fits.append((max(one, other), fit.R_prev_cur, fit.t if one >= other else -fit.t, fit.cost))
     if not fits:
         return None
-    best = min(fits, key=lambda fit: fit.cost)
-    R, t = best.R_prev_cur, best.t
-    if _ahead(pairs, R, -t) > _ahead(pairs, R, t):
-        t = -t
-    return _refine(pairs, R, t, sigma_px, exact=True)
+    # Points on one plane fit two motions equally well; mostly only one of them puts all points before the cameras.
+    limit = min(fit[3] for fit in fits) + _SAME_COST / len(pairs)
+    level = [fit for fit in fits if fit[3] <= limit]
+    ahead, R, t, _ = max(level, key=lambda fit: (round(fit[0], 3), -fit[3]))
+    ambiguous = any(fit[0] > _AS_GOOD * ahead and float(fit[2] @ t) < _OTHER_DIRECTION for fit in level)
+    return replace(_refine(pairs, R, t, sigma_px, exact=True), ambiguous=ambiguous)
 
 
 def _search_directions(pairs: Pairs, R_start: Array, sigma_px: float) -> list[tuple[Array, Array]]:

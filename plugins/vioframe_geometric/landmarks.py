@@ -1,8 +1,8 @@
 """Points of the map: inverse depth from a fixed anchor, with a covariance, all in parallel arrays.
 
-``x = o + R_o (a, b, 1)ᵀ / ρ`` (Civera, Davison, Montiel 2008, without the anchor's pose as a state: o and R_o are constants
-that only choose coordinates in which the error of a young point is normal). In these coordinates the pixel of a
-point is nearly linear in ρ, also where its depth is hardly known.
+``x = o + R_o (a, b, 1)ᵀ / ρ`` (Civera, Davison, Montiel 2008, without the anchor's pose as a state: o and R_o are
+constants that only choose coordinates in which the error of a young point is normal). In these coordinates the pixel
+of a point is nearly linear in ρ, also where its depth is hardly known.
 """
 
 from collections.abc import Sequence
@@ -105,7 +105,8 @@ class Landmarks:
         """Positions (M, 3) in the map frame."""
         q = self.q[index]
         ray = np.concatenate([q[:, :2], np.ones((len(q), 1))], axis=-1) / q[:, 2:]
-        return self.origins[index] + (self.rotations[index] @ ray[..., None])[..., 0]
+        points: Array = self.origins[index] + (self.rotations[index] @ ray[..., None])[..., 0]
+        return points
 
     def slopes(self, index: np.ndarray) -> Array:
         """∂x/∂q (M, 3, 3)."""
@@ -116,12 +117,19 @@ class Landmarks:
         out[:, 0, 2] = -q[:, 0] * inverse**2
         out[:, 1, 2] = -q[:, 1] * inverse**2
         out[:, 2, 2] = -(inverse**2)
-        return self.rotations[index] @ out
+        slope: Array = self.rotations[index] @ out
+        return slope
 
     def point_covariance(self, index: np.ndarray) -> Array:
         """Covariance (M, 3, 3) of the positions."""
         slope = self.slopes(index)
-        return slope @ self.covariance[index] @ np.swapaxes(slope, -1, -2)
+        covariance: Array = slope @ self.covariance[index] @ np.swapaxes(slope, -1, -2)
+        return covariance
+
+    def point_root(self, index: np.ndarray) -> Array:
+        """S (M, 3, 3) with S Sᵀ the covariance of the positions."""
+        root: Array = self.slopes(index) @ _root(self.covariance[index])
+        return root
 
     def rescale(self, factor: float, centre: Array) -> None:
         """Multiply all distances from ``centre`` (3,) by ``factor``."""
@@ -170,7 +178,8 @@ class Landmarks:
         weighted = (inverse @ error[..., None])[..., 0]
         distance = np.sum(error * weighted, axis=-1)
         seen = np.stack([view.seen for view in views])
-        accepted = ahead & seen.any(axis=0) & (distance < np.where(seen.sum(axis=0) > 1, _GATE[4], _GATE[2]))
+        gate = np.where(seen.sum(axis=0) > 1, _GATE[4], _GATE[2])
+        accepted: np.ndarray = ahead & seen.any(axis=0) & (distance < gate)
         step = -(gain @ error[..., None])[..., 0]
         shrunk = P - gain @ np.swapaxes(PHt, -1, -2)
         chosen = index[accepted]
@@ -181,3 +190,13 @@ class Landmarks:
         self.strikes[chosen] = 0
         self.strikes[index[~accepted & seen.any(axis=0)]] += 1
         return accepted
+
+
+def _root(covariance: Array) -> Array:
+    """Square roots (M, 3, 3) of covariances, also of one that rounding has made slightly indefinite."""
+    try:
+        return np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(covariance)
+        root: Array = vectors * np.sqrt(np.maximum(values, 1e-14))[:, None, :]
+        return root

@@ -59,7 +59,7 @@ def fit_pose(
     views: Sequence[View],
     *,
     sigma_px: float,
-    point_covariance: Array | None = None,
+    point_root: Array | None = None,
     robust_scale: float = 2.0,
     iterations: int = 10,
 ) -> PoseFit:
@@ -73,7 +73,8 @@ def fit_pose(
         points_ref: (M, 3).
         views: of the cameras of the rig.
         sigma_px: standard deviation of a pixel coordinate.
-        point_covariance: P (M, 3, 3) in the reference frame, or None for points known exactly.
+        point_root: S (M, 3, 3) with P = S Sᵀ the covariance of the points in the reference frame, or None for points
+            known exactly.
         robust_scale: of the Cauchy loss, in standard deviations a degree of freedom.
         iterations: at most.
     """
@@ -89,7 +90,7 @@ def fit_pose(
         points_cam = (points_ref - T[:3, 3]) @ T[:3, :3]
         error, slope, ahead = stack_residuals(views, points_cam)
         if whitening is None:
-            whitening = whiten(slope @ T[:3, :3].T, sigma_px, point_covariance)
+            whitening = whiten(slope @ T[:3, :3].T, sigma_px, point_root)
         error = (whitening @ error[..., None])[..., 0]
         squared = np.sum(error * error, axis=-1) / freedom
         used = ahead & counted
@@ -137,11 +138,16 @@ def stack_residuals(views: Sequence[View], points_cam: Array) -> tuple[Array, Ar
     return np.concatenate(errors, axis=-1), np.concatenate(slopes, axis=-2), ahead
 
 
-def whiten(slope_ref: Array, sigma_px: float, point_covariance: Array | None) -> Array:
-    """W (M, N, N) with ``Wᵀ W = (σ² I + J P Jᵀ)⁻¹``, for J (M, N, 3)."""
+def whiten(slope_ref: Array, sigma_px: float, point_root: Array | None) -> Array:
+    """W (M, N, N) with ``Wᵀ W = (σ² I + (J S)(J S)ᵀ)⁻¹``, for J (M, N, 3) and S (M, 3, 3).
+
+    The covariance of a far point is huge along its ray, where J is almost zero: only the product of roots stays
+    positive definite in floating point.
+    """
     count, size = slope_ref.shape[:2]
-    if point_covariance is None:
+    if point_root is None:
         return np.broadcast_to(np.eye(size) / sigma_px, (count, size, size))
-    covariance = slope_ref @ point_covariance @ np.swapaxes(slope_ref, -1, -2) + sigma_px**2 * np.eye(size)
+    half = slope_ref @ point_root
+    covariance = half @ np.swapaxes(half, -1, -2) + sigma_px**2 * np.eye(size)
     inverse: Array = np.linalg.inv(np.linalg.cholesky(covariance))
     return inverse

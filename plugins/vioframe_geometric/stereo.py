@@ -31,6 +31,7 @@ class StereoVO(VOEstimator):
 
     Args:
         sigma_px: standard deviation of a tracked point's coordinate.
+        adapt_sigma: learn it from the errors, beginning with ``sigma_px``.
         min_points: fewer agreeing points give no motion.
         min_depth: nearer points are not matched, m.
         window_px: odd side of the patch matched between the images.
@@ -87,6 +88,9 @@ class StereoVO(VOEstimator):
         self._drift = drift_px
         self._covariance_scale = covariance_scale
         self._camera: Camera | None = None
+        self._T_map_cam: Array
+        self._motion: Array
+        self._pose_covariance: Array
 
     def setup(self, rig: SensorRig) -> None:
         """Forget the map and take the calibration of cameras 0 and 1.
@@ -107,6 +111,7 @@ class StereoVO(VOEstimator):
             forward_backward_px=self._back,
         )
         self._resets = 0
+        self._stamp_ns: int | None = None
         self._noise = PixelNoise(self._start_sigma)
         self._restart()
 
@@ -171,7 +176,6 @@ class StereoVO(VOEstimator):
         self._T_map_cam = np.eye(4)
         self._motion = np.eye(4)
         self._pose_covariance = np.zeros((6, 6))
-        self._stamp_ns: int | None = None
 
     def _see(self, frame: Frame, tracks: Tracks) -> tuple[View, View]:
         """The tracks in both images."""

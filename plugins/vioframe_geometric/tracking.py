@@ -72,11 +72,11 @@ def locate(
         return None
     index = index[rows]
     points = landmarks.points(index)
-    covariance = landmarks.point_covariance(index)
+    root = landmarks.point_root(index)
     seen = [select_view(view, rows) for view in views]
 
     def fit(start: Array) -> PoseFit:
-        return fit_pose(start, points, seen, sigma_px=sigma_px, point_covariance=covariance)
+        return fit_pose(start, points, seen, sigma_px=sigma_px, point_root=root)
 
     best: PoseFit | None = None
     for start in starts:
@@ -86,7 +86,7 @@ def locate(
         if _convincing(best, min_inliers):
             break
     else:
-        start_pnp = _solve_pnp(points, covariance, seen[0], sigma_px)
+        start_pnp = _solve_pnp(points, root, seen[0], sigma_px)
         if start_pnp is not None:
             found = fit(start_pnp)
             if best is None or found.cost < best.cost:
@@ -111,9 +111,9 @@ def _convincing(fit: PoseFit, min_inliers: int) -> bool:
     return agreeing >= min_inliers and agreeing >= MIN_SHARE * len(fit.errors)
 
 
-def _solve_pnp(points: Array, covariance: Array, view: View, sigma_px: float) -> Array | None:
+def _solve_pnp(points: Array, root: Array, view: View, sigma_px: float) -> Array | None:
     """A rough T_map_cam (4, 4) from the better-known half of the points."""
-    depth_spread = np.trace(covariance, axis1=1, axis2=2)
+    depth_spread = np.sum(root * root, axis=(1, 2))
     rows = np.flatnonzero(view.seen & (depth_spread <= np.median(depth_spread)))
     if len(rows) < 6:
         return None
@@ -147,7 +147,7 @@ class PixelNoise:
         smallest_px, largest_px: its bounds.
     """
 
-    def __init__(self, sigma_px: float, smallest_px: float = 0.08, largest_px: float = 2.0) -> None:
+    def __init__(self, sigma_px: float, smallest_px: float = 0.1, largest_px: float = 2.0) -> None:
         self._bounds = (min(smallest_px, sigma_px), max(largest_px, sigma_px))
         self.sigma_px = sigma_px
 

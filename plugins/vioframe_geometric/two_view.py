@@ -92,7 +92,8 @@ class TwoViewVO(VOEstimator):
         inflation *= 1.0 + _RUGGED * self._sigma / parallax
         covariance = unit_covariance(fit, inflation)
         direction = inflation * np.linalg.eigvalsh(fit.covariance[3:, 3:])[-1]
-        valid = inliers >= max(self._min_points, 0.5 * len(pairs)) and direction < self._max_direction**2
+        agreed = inliers >= max(self._min_points, 0.5 * len(pairs))
+        valid = agreed and not fit.ambiguous and direction < self._max_direction**2
         return RelativePose(
             T_prev_cur=se3.from_parts(fit.R_prev_cur, fit.t), covariance=covariance, valid=bool(valid), inliers=inliers
         )

@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+
 from vioframe.checks import Array
 
 # OpenCV's cornerMinEigenVal (3×3 Sobel, image in [0, 1]) returns four times the smaller eigenvalue of the mean

@@ -6,12 +6,12 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
+
 from vioframe.checks import Array
 from vioframe.errors import ConfigError, DataError, ShapeError, StateError
 from vioframe.geometry import camera as projection
 from vioframe.interfaces import TRACKS, Frontend
 from vioframe.types import Camera, Frame, Image, SensorRig, Tracks, VisualFeatures
-
 from vioframe_klt.detector import CornerDetector
 from vioframe_klt.outliers import epipolar_inliers
 
@@ -26,6 +26,7 @@ _LEVELS_BACK = 1
 _MIN_KEPT = 0.85
 _SPARSE = 0.5
 _RETRY_IMAGES = 10
+_INVERTIBLE_PX = 0.5
 
 
 class KltFrontend(Frontend):
@@ -54,7 +55,7 @@ class KltFrontend(Frontend):
         clahe_clip: its limit.
         clahe_tiles: along each side.
         border_px: no points nearer to the edge of the image.
-        max_angle_deg: no new points further from the optical axis, or None.
+        max_angle_deg: no points further from the optical axis, or None.
 
     Raises:
         ConfigError: an option outside its range.
@@ -141,11 +142,8 @@ class KltFrontend(Frontend):
         allowed = np.zeros((height, width), np.uint8)
         inner = slice(self._border, height - self._border), slice(self._border, width - self._border)
         allowed[inner] = 255
-        if self._max_angle_deg is not None:
-            columns, rows = np.meshgrid(np.arange(0, width, 4.0), np.arange(0, height, 4.0))
-            rays = projection.bearings(camera, np.stack([columns, rows], axis=-1))
-            seen = (rays[..., 2] >= np.cos(np.radians(self._max_angle_deg))).astype(np.uint8) * 255
-            allowed &= cv2.resize(seen, (width, height), interpolation=cv2.INTER_NEAREST)
+        self._invertible = cv2.resize(self._usable(camera), (width, height), interpolation=cv2.INTER_NEAREST)
+        allowed &= self._invertible
         self._detector = CornerDetector(
             min_distance_px=self._min_distance,
             quality=self._quality,
@@ -201,6 +199,21 @@ class KltFrontend(Frontend):
             scores=points.ages.astype(float),
         )
         return VisualFeatures(frame=frame, tracks=tracks)
+
+    def _usable(self, camera: Camera) -> np.ndarray:
+        """Every fourth pixel (H/4, W/4) uint8: 255 where the camera model can be inverted and the angle is allowed."""
+        width, height = camera.size_px
+        columns, rows = np.meshgrid(np.arange(0, width, 4.0), np.arange(0, height, 4.0))
+        pixels = np.stack([columns, rows], axis=-1)
+        # Beyond the range of its polynomial, a radial-tangential model folds back: its inverse then diverges.
+        with np.errstate(all="ignore"):
+            rays = projection.bearings(camera, pixels)
+            back, _ = projection.project(camera, rays)
+            usable = np.linalg.norm(back - pixels, axis=-1) < _INVERTIBLE_PX
+        if self._max_angle_deg is not None:
+            usable &= rays[..., 2] >= np.cos(np.radians(self._max_angle_deg))
+        mask: np.ndarray = usable.astype(np.uint8) * 255
+        return mask
 
     def _prepare(self, frame: Frame, camera: Camera) -> Image:
         if not frame.images:
@@ -274,6 +287,9 @@ class KltFrontend(Frontend):
             & (found[:, 0] < width - 1 - low)
             & (found[:, 1] < height - 1 - low)
         )
+        column = np.clip(np.rint(found[:, 0]), 0, width - 1).astype(int)
+        row = np.clip(np.rint(found[:, 1]), 0, height - 1).astype(int)
+        keep &= self._invertible[row, column] > 0
         followed = points.select(keep).moved(found[keep].astype(float))
         if self._reject and len(followed) >= 8:
             focal = float(np.mean(camera.intrinsics_px[:2]))

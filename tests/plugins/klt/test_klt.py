@@ -5,12 +5,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+
+from shared_data import shared_data
 from vioframe.errors import ConfigError, DataError, ShapeError, StateError
 from vioframe.geometry import camera as projection
 from vioframe.geometry import so3
 from vioframe.types import Camera, Frame, ImuNoise, SensorRig
-
-from shared_data import shared_data
 from vioframe_klt import KltFrontend
 from vioframe_klt.detector import CornerDetector
 from vioframe_klt.outliers import epipolar_inliers
