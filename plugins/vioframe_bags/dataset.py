@@ -7,13 +7,14 @@ import numpy as np
 
 from vioframe.checks import Array, Stamps, check_pose
 from vioframe.conventions import GRAVITY, NANOSECONDS
-from vioframe.data import screening
+from vioframe.data import agreement, screening
 from vioframe.data.recording import Dataset, Finding
 from vioframe.data.selection import (
     STEREO_TOLERANCE_NS,
     FrameSelection,
     as_names,
     check_camera_count,
+    check_given,
     choose_frames,
     match_stamps,
     sample_span,
@@ -61,10 +62,12 @@ class BagDataset(Dataset):
             raise ConfigError(f"dataset.gravity must be positive, got {gravity}")
         self._camera_count = check_camera_count(cameras)
         self._selection = FrameSelection(every=every, start_s=start_s, duration_s=duration_s)
-        self._root = Path(root).expanduser()
+        advice = "dataset=bag needs a .bag, .mcap or .db3 file, a folder with metadata.yaml, or a folder of such"
+        self._root = Path(check_given("root", root, advice)).expanduser()
         self._bags = find_bags(self._root)
         self._names = self._choose(as_names(sequence))
-        self._imu_calibration = self._locate(imu_calibration)
+        advice = "set it to Kalibr's imu.yaml or EuRoC's imu0/sensor.yaml"
+        self._imu_calibration = self._locate(check_given("imu_calibration", imu_calibration, advice))
         self._camera_calibration = [self._locate(path) for path in as_names(camera_calibration)]
         self._imu_topic = imu_topic
         self._camera_topics = as_names(camera_topics)
@@ -101,7 +104,7 @@ class BagDataset(Dataset):
         findings.append(screening.check_gaps(imu.stamps_ns, _longest_step_ns(imu)))
         truth = self._truth(bag, contents, imu, findings)
         if truth is not None:
-            findings += screening.check_with_truth(imu, truth, where, advice=_TRUTH_ADVICE)
+            findings += agreement.check_with_truth(imu, truth, where, advice=_TRUTH_ADVICE)
         delay_ns = self._delay(calibrated, findings)
         all_stamps_ns = contents.image_stamps(topics, str(bag.path))
         pairs = _pair(bag, topics, all_stamps_ns, findings)

@@ -12,7 +12,7 @@ import numpy as np
 
 from vioframe.checks import Array, Stamps
 from vioframe.conventions import NANOSECONDS
-from vioframe.data import screening
+from vioframe.data import agreement, screening
 from vioframe.data.calibration import camera_of_sensor, imu_of_sensor, motion_of, read_yaml
 from vioframe.data.recording import Finding
 from vioframe.data.selection import (
@@ -115,7 +115,7 @@ class AslDataset(PartedDataset):
         findings += found
         truth = self._truth(folder, T_body_imu, findings)
         if truth is not None:
-            findings += screening.check_with_truth(imu, truth, str(imu_file))
+            findings += agreement.check_with_truth(imu, truth, str(imu_file))
         kept, found = choose_frames(
             stamps_ns, imu, self.selection, delay_ns=self.camera_delay_ns, where=str(stamps_file), truth=truth
         )

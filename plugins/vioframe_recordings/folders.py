@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from vioframe.checks import Mask
-from vioframe.errors import ConfigError, DataError
+from vioframe.data.selection import check_given
+from vioframe.errors import DataError
 
 
 def find_root(root: str | None, key: str) -> Path:
@@ -16,10 +17,7 @@ def find_root(root: str | None, key: str) -> Path:
         ConfigError: not set.
         DataError: not there.
     """
-    # An option left at ??? arrives as that text.
-    if not root or root == "???":
-        raise ConfigError(f"dataset.root is not set: dataset={key} needs the folder that holds the sequences")
-    path = Path(root).expanduser()
+    path = Path(check_given("root", root, f"dataset={key} needs the folder that holds the sequences")).expanduser()
     if not path.is_dir():
         raise DataError(f"{path}: no such folder (dataset.root): check the path, or fetch the data set")
     return path

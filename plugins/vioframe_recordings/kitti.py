@@ -13,7 +13,7 @@ import numpy as np
 
 from vioframe.checks import Array, Mask, Stamps
 from vioframe.conventions import NANOSECONDS
-from vioframe.data import screening
+from vioframe.data import agreement, screening
 from vioframe.data.recording import Dataset, Finding
 from vioframe.data.selection import FrameSelection, as_names, check_camera_count, choose_frames
 from vioframe.errors import DataError
@@ -115,7 +115,7 @@ class KittiDataset(Dataset):
         truth = self._truth(sequence, drive, imu, times_ns, findings)
         if truth is not None:
             # Levelled by this accelerometer, the vertical of the truth says nothing about it.
-            findings += screening.check_with_truth(imu, truth, str(imu_file), vertical=False)
+            findings += agreement.check_with_truth(imu, truth, str(imu_file), vertical=False)
             findings.append(check_level(imu, truth))
         usable, paths, missing = self._available(folder, len(times_ns), findings)
         cameras = self._cameras(folder, drive, paths, findings)
@@ -262,8 +262,8 @@ def check_vehicle_up(imu: ImuBlock, where: str) -> Finding:
         DataError: it is not; axes or columns are swapped.
     """
     force = imu.accel.mean(axis=0)
-    tilt = screening.tilt_deg(force)
-    if tilt > screening.TILT_BAD_DEG:
+    tilt = agreement.tilt_deg(force)
+    if tilt > agreement.TILT_BAD_DEG:
         raise DataError(
             f"{where}: the mean specific force is ({force[0]:.2f}, {force[1]:.2f}, {force[2]:.2f}) m/s², {tilt:.0f}° "
             "from the vehicle's z axis, but a car stays upright: columns or axes are swapped; put them right"
@@ -280,7 +280,7 @@ def check_level(imu: ImuBlock, truth: Trajectory) -> Finding:
         half = Trajectory(stamps_ns=truth.stamps_ns[part], T_world_body=truth.T_world_body[part])
         if truth.v_world_body is not None:
             half = replace(half, v_world_body=truth.v_world_body[part])
-        tilts.append(screening.tilt_deg(screening.mean_specific_force(imu, half)[0]))
+        tilts.append(agreement.tilt_deg(agreement.mean_specific_force(imu, half)[0]))
     text = f"the halves of the recording put the vertical {tilts[0]:.2f}° and {tilts[1]:.2f}° off the whole"
     return Finding(level="good" if max(tilts) < 1.0 else "note", subject="level of the world", text=text)
 
@@ -302,7 +302,7 @@ def level_world(stamps_ns: Stamps, T_ref_body: Array, imu: ImuBlock) -> tuple[Tr
     """
     velocity = spline_velocities(stamps_ns, T_ref_body[:, :3, 3])
     reference = Trajectory(stamps_ns=stamps_ns, T_world_body=T_ref_body, v_world_body=velocity)
-    up, _ = screening.mean_specific_force(imu, reference)
+    up, _ = agreement.mean_specific_force(imu, reference)
     R_level_ref = so3.from_two_vectors(up, np.array([0.0, 0.0, 1.0]))
     heading = R_level_ref @ T_ref_body[0, :3, 0]
     R_world_ref = so3.rotation_z(-np.arctan2(heading[1], heading[0])) @ R_level_ref

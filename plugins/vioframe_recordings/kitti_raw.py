@@ -12,7 +12,7 @@ import numpy as np
 
 from vioframe.checks import Stamps
 from vioframe.conventions import NANOSECONDS
-from vioframe.data import screening
+from vioframe.data import agreement, screening
 from vioframe.data.recording import Finding
 from vioframe.data.selection import FrameSelection, as_names, check_camera_count, choose_frames
 from vioframe.errors import ConfigError, DataError
@@ -96,7 +96,7 @@ class KittiRawDataset(PartedDataset):
         imu, found = self.gap_treatment.treat(imu, sequence, where)
         findings += found
         # An accelerometer derived from the truth agrees with it by construction.
-        findings += screening.check_with_truth(imu, truth, where, vertical=source != "klt")
+        findings += agreement.check_with_truth(imu, truth, where, vertical=source != "klt")
         stamps_ns, paths, missing, stamps_file = self._frames(name, folder, imu)
         kept, found = choose_frames(
             stamps_ns, imu, self.selection, delay_ns=self.camera_delay_ns, where=stamps_file, truth=truth

@@ -28,6 +28,18 @@ def as_names(chosen: str | int | Sequence[str | int] | None) -> list[str]:
     return [str(name) for name in chosen]
 
 
+def check_given(key: str, value: str | None, advice: str) -> str:
+    """An option without a default.
+
+    Raises:
+        ConfigError: it is not set.
+    """
+    # One that is left at ??? arrives as that text.
+    if not value or value == "???":
+        raise ConfigError(f"dataset.{key} is not set: {advice}")
+    return value
+
+
 def check_camera_count(cameras: int) -> int:
     """``dataset.cameras``.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vioframe.data import screening
+from vioframe.data import agreement
 from vioframe.data.checked import BLOCK_NS
 from vioframe.data.selection import match_stamps
 from vioframe.errors import ClockError, DataError
@@ -332,7 +332,7 @@ def test_the_vertical_is_found_in_a_short_clip(make_asl: Maker) -> None:
     truth = recording.ground_truth()
     assert truth is not None
     imu, _ = read_imu(Path(recording._image_paths[0][0]).parents[2])
-    force, _ = screening.mean_specific_force(imu, truth)
+    force, _ = agreement.mean_specific_force(imu, truth)
     np.testing.assert_allclose(force, [0.0, 0.0, 9.81], atol=0.02)
 
 

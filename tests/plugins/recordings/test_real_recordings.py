@@ -8,7 +8,7 @@ import pytest
 
 from shared_data import shared_data
 from vioframe.checks import Array
-from vioframe.data import screening
+from vioframe.data import agreement
 from vioframe.errors import DataError
 from vioframe.geometry.interpolation import interpolate_poses
 from vioframe.types import Frame, ImuBlock, Trajectory
@@ -27,8 +27,8 @@ def truth_of(recording: StoredRecording) -> Trajectory:
     return truth
 
 
-def agreement(imu: ImuBlock, truth: Trajectory) -> Array:
-    return screening.correlations(*screening.rotation_rates(imu, truth))
+def gyro_agreement(imu: ImuBlock, truth: Trajectory) -> Array:
+    return agreement.correlations(*agreement.rotation_rates(imu, truth))
 
 
 @pytest.mark.parametrize("name", EUROC)
@@ -39,9 +39,9 @@ def test_euroc(name: str) -> None:
     assert time.process_time() - started < 1.5
     truth = truth_of(recording)
     assert not [f for f in recording.findings() if f.level == "bad"]
-    assert agreement(recording.imu, truth).min() > 0.997
-    force, _ = screening.mean_specific_force(recording.imu, truth)
-    assert screening.tilt_deg(force) < 2.0
+    assert gyro_agreement(recording.imu, truth).min() > 0.997
+    force, _ = agreement.mean_specific_force(recording.imu, truth)
+    assert agreement.tilt_deg(force) < 2.0
     # Zurich has 9.807 m/s²; the rest is the bias of the accelerometer (about 0.05 to 0.15 along x and z).
     assert np.linalg.norm(force) == pytest.approx(9.807, abs=0.1)
     # Velocities of the truth are the derivatives of its positions.
@@ -58,7 +58,7 @@ def test_euroc_corrected_truth_is_more_level() -> None:
     tilts = []
     for choice in ("default", "corrected"):
         recording = EurocDataset(root=root, sequence="V1_01_easy", images=False, ground_truth=choice).open("V1_01_easy")
-        tilts.append(screening.tilt_deg(screening.mean_specific_force(recording.imu, truth_of(recording))[0]))
+        tilts.append(agreement.tilt_deg(agreement.mean_specific_force(recording.imu, truth_of(recording))[0]))
     assert tilts[1] < 0.7 < 1.5 < tilts[0]
 
 
@@ -84,13 +84,13 @@ def test_tumvi_mocap_is_of_the_imu(name: str) -> None:
     root = shared_data("tumvi", name).parent
     recording = TumviDataset(root=str(root), sequence=name, images=False).open(name)
     truth = truth_of(recording)
-    measured, true = screening.rotation_rates(recording.imu, truth)
+    measured, true = agreement.rotation_rates(recording.imu, truth)
     # Axis by axis: a mocap body turned against the IMU would mix the axes. Mocap noise limits the rest.
-    assert screening.correlations(measured, true).min() > 0.98
+    assert agreement.correlations(measured, true).min() > 0.98
     centred = true - true.mean(axis=0)
     assert (measured * centred).sum() / (centred**2).sum() == pytest.approx(1.0, abs=0.03)
-    force, _ = screening.mean_specific_force(recording.imu, truth)
-    assert screening.tilt_deg(force) < 1.0
+    force, _ = agreement.mean_specific_force(recording.imu, truth)
+    assert agreement.tilt_deg(force) < 1.0
     # Drop-outs are kept: nothing is put in their place.
     assert np.diff(truth.stamps_ns).max() > 500_000_000
     assert recording.rig.cameras[0].model == "equidistant"
@@ -114,7 +114,7 @@ def test_kitti(name: str) -> None:
     truth = truth_of(recording)
     assert not [f for f in recording.findings() if f.level == "bad"]
     # Noise of the truth (0.1 s between poses) limits roll and pitch; yaw is what a car does.
-    correlation = agreement(recording.imu, truth)
+    correlation = gyro_agreement(recording.imu, truth)
     assert correlation[2] > 0.99 and correlation.min() > 0.95
     # The two halves of the drive, averaged apart, agree on the vertical.
     finding = check_level(recording.imu, truth)
@@ -132,7 +132,7 @@ def test_kitti_samples_lag_by_the_default_delay(name: str) -> None:
     residuals = []
     for delay_s in (0.0, 0.065, 0.13):
         recording = KittiDataset(root=str(kitti_root()), sequence=name, images=False, camera_delay_s=delay_s).open(name)
-        measured, true = screening.rotation_rates(recording.imu, truth_of(recording))
+        measured, true = agreement.rotation_rates(recording.imu, truth_of(recording))
         residuals.append(float((measured - true)[5:-5, 2].std()))
     assert residuals[1] < 0.5 * min(residuals[0], residuals[2])
 
@@ -223,8 +223,8 @@ def test_wrong_axes_are_found_and_named(source: str, accel: list[int], said: str
     else:
         recording = KittiDataset(root=str(kitti_root()), sequence="07", images=False).open("07")
     truth = truth_of(recording)
-    screening.check_with_truth(recording.imu, truth, "imu")
+    agreement.check_with_truth(recording.imu, truth, "imu")
     with pytest.raises(DataError, match=f"accelerometer agrees .* only when its axes are taken as {said}"):
-        screening.check_with_truth(turned(recording.imu, accel=accel), truth, "imu")
+        agreement.check_with_truth(turned(recording.imu, accel=accel), truth, "imu")
     with pytest.raises(DataError, match=f"gyro agrees .* only when its axes are taken as {said}"):
-        screening.check_with_truth(turned(recording.imu, gyro=accel), truth, "imu")
+        agreement.check_with_truth(turned(recording.imu, gyro=accel), truth, "imu")
