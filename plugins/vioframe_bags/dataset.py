@@ -15,6 +15,7 @@ from vioframe.data.selection import (
     as_names,
     check_camera_count,
     check_given,
+    check_gravity,
     choose_frames,
     match_stamps,
     sample_span,
@@ -58,8 +59,6 @@ class BagDataset(Dataset):
     ) -> None:
         if not 8 <= mono16_bits <= 16:
             raise ConfigError(f"dataset.mono16_bits must be from 8 to 16, got {mono16_bits}")
-        if not gravity > 0.0:
-            raise ConfigError(f"dataset.gravity must be positive, got {gravity}")
         self._camera_count = check_camera_count(cameras)
         self._selection = FrameSelection(every=every, start_s=start_s, duration_s=duration_s)
         advice = "dataset=bag needs a .bag, .mcap or .db3 file, a folder with metadata.yaml, or a folder of such"
@@ -78,7 +77,7 @@ class BagDataset(Dataset):
         self._color = color
         self._mono16_bits = mono16_bits
         self._camera_delay_s = camera_delay_s
-        self._gravity = gravity
+        self._gravity = check_gravity(gravity)
 
     @property
     def sequences(self) -> Sequence[str]:

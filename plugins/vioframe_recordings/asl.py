@@ -11,7 +11,6 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 
 from vioframe.checks import Array, Stamps
-from vioframe.conventions import NANOSECONDS
 from vioframe.data import agreement, screening
 from vioframe.data.calibration import camera_of_sensor, imu_of_sensor, motion_of, read_yaml
 from vioframe.data.recording import Finding
@@ -19,16 +18,15 @@ from vioframe.data.selection import (
     STEREO_TOLERANCE_NS,
     FrameSelection,
     as_names,
-    check_camera_count,
     choose_frames,
     match_stamps,
 )
 from vioframe.errors import ClockError, ConfigError, DataError
 from vioframe.geometry import se3
 from vioframe.trajectory_io import read_trajectory
-from vioframe.types import Camera, ImuNoise, SensorRig, Trajectory
+from vioframe.types import Camera, ImuNoise, Trajectory
 from vioframe_recordings.asl_files import find_truth, has_truth, read_frame_list, read_imu, sequences_under
-from vioframe_recordings.folders import find_images, find_root
+from vioframe_recordings.folders import find_images
 from vioframe_recordings.gaps import GapPolicy, GapTreatment, PartedDataset
 from vioframe_recordings.stored import StoredRecording, check_first_images
 
@@ -86,16 +84,19 @@ class AslDataset(PartedDataset):
             raise ConfigError(
                 f"dataset.calibration must be one of {', '.join(get_args(Calibration))}, got {calibration!r}"
             )
-        self.camera_count = check_camera_count(cameras)
-        self.selection = FrameSelection(every=every, start_s=start_s, duration_s=duration_s)
-        treatment = GapTreatment(policy=gap_policy, max_gap_s=max_gap_s, max_fill_s=max_fill_s)
-        self.root = find_root(root, self.profile.key)
-        self.images = images
+        super().__init__(
+            key=self.profile.key,
+            root=root,
+            images=images,
+            cameras=cameras,
+            selection=FrameSelection(every=every, start_s=start_s, duration_s=duration_s),
+            camera_delay_s=camera_delay_s,
+            gravity=gravity,
+        )
         self.calibration = calibration
         self.truth_choice = ground_truth
-        self.camera_delay_ns = round(camera_delay_s * NANOSECONDS)
-        self.gravity = gravity
-        super().__init__(as_names(sequence) or self._all_sequences(), treatment)
+        self.gap_treatment = GapTreatment(policy=gap_policy, max_gap_s=max_gap_s, max_fill_s=max_fill_s)
+        self._chosen = as_names(sequence) or self._all_sequences()
 
     def open(self, sequence: str) -> StoredRecording:
         """Open and check one sequence.
@@ -121,18 +122,12 @@ class AslDataset(PartedDataset):
         )
         findings += found
         paths = [[files[i] for i in kept] for files in paths]
-        rig_cameras = cameras[: self.camera_count]
+        rig = self._rig(cameras, noise)
         if self.images:
-            self._check_images(folder, paths, rig_cameras, findings)
+            self._check_images(folder, paths, rig.cameras, findings)
         return StoredRecording(
             name=sequence,
-            rig=SensorRig(
-                cameras=rig_cameras,
-                imu=noise,
-                gravity=self.gravity,
-                camera_delay_ns=self.camera_delay_ns,
-                has_images=self.images,
-            ),
+            rig=rig,
             imu=imu,
             frame_stamps_ns=stamps_ns[kept],
             image_paths=paths,

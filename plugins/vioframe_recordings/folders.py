@@ -6,8 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from vioframe.checks import Mask
-from vioframe.data.selection import check_given
+from vioframe.conventions import NANOSECONDS
+from vioframe.data.recording import Dataset
+from vioframe.data.selection import FrameSelection, check_camera_count, check_given, check_gravity
 from vioframe.errors import DataError
+from vioframe.types import Camera, ImuNoise, SensorRig
 
 
 def find_root(root: str | None, key: str) -> Path:
@@ -21,6 +24,52 @@ def find_root(root: str | None, key: str) -> Path:
     if not path.is_dir():
         raise DataError(f"{path}: no such folder (dataset.root): check the path, or fetch the data set")
     return path
+
+
+class FolderDataset(Dataset):
+    """The options that all data sets in folders share, with the meaning that their YAML gives them.
+
+    Args:
+        key: of the data set in the configuration, for messages.
+        root: folder that holds the sequences.
+        images: read images; else stamps only.
+        cameras: to stream, 1 or 2.
+        selection: of frames.
+        camera_delay_s: ``t_imu = t_cam + camera_delay_s``.
+        gravity: magnitude, m/s².
+
+    Raises:
+        ConfigError: names the key.
+        DataError: there is no such folder.
+    """
+
+    def __init__(
+        self,
+        *,
+        key: str,
+        root: str,
+        images: bool,
+        cameras: int,
+        selection: FrameSelection,
+        camera_delay_s: float,
+        gravity: float,
+    ) -> None:
+        self.camera_count = check_camera_count(cameras)
+        self.gravity = check_gravity(gravity)
+        self.root = find_root(root, key)
+        self.images = images
+        self.selection = selection
+        self.camera_delay_ns = round(camera_delay_s * NANOSECONDS)
+
+    def _rig(self, cameras: Sequence[Camera], noise: ImuNoise) -> SensorRig:
+        """Calibration of what is streamed, of all cameras that are known."""
+        return SensorRig(
+            cameras=tuple(cameras[: self.camera_count]),
+            imu=noise,
+            gravity=self.gravity,
+            camera_delay_ns=self.camera_delay_ns,
+            has_images=self.images,
+        )
 
 
 def names_in(folder: Path) -> set[str]:

@@ -10,10 +10,11 @@ import numpy as np
 
 from vioframe.checks import Stamps
 from vioframe.conventions import NANOSECONDS
-from vioframe.data.recording import Dataset, Finding
+from vioframe.data.recording import Finding
 from vioframe.data.screening import check_gaps, describe_gaps, find_gaps
 from vioframe.errors import ClockError, ConfigError, DataError
 from vioframe.types import ImuBlock
+from vioframe_recordings.folders import FolderDataset
 
 GapPolicy = Literal["keep", "fill", "split", "refuse"]
 """``keep`` leaves holes to the synchronizer, which reports them; ``fill`` puts interpolated samples in them;
@@ -113,18 +114,16 @@ def stretches(stamps_ns: Stamps, max_gap_ns: int) -> list[tuple[int, int]]:
     return [(start, end) for start, end in pairwise(cuts) if end - start >= 10]
 
 
-class PartedDataset(Dataset):
+class PartedDataset(FolderDataset):
     """A data set in which each stretch without a hole can be a sequence of its own.
 
-    Args:
-        chosen: names of the recordings.
-        gap_treatment: the options.
+    Attributes:
+        gap_treatment: the options, set by the constructor of the data set, with ``_chosen``, names of recordings.
     """
 
-    def __init__(self, chosen: Sequence[str], gap_treatment: GapTreatment) -> None:
-        self.gap_treatment = gap_treatment
-        self._chosen = list(chosen)
-        self._names: list[str] | None = None
+    gap_treatment: GapTreatment
+    _chosen: Sequence[str]
+    _names: list[str] | None = None
 
     @property
     def sequences(self) -> Sequence[str]:

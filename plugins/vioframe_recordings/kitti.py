@@ -12,15 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from vioframe.checks import Array, Mask, Stamps
-from vioframe.conventions import NANOSECONDS
 from vioframe.data import agreement, screening
-from vioframe.data.recording import Dataset, Finding
-from vioframe.data.selection import FrameSelection, as_names, check_camera_count, choose_frames
+from vioframe.data.recording import Finding
+from vioframe.data.selection import FrameSelection, as_names, choose_frames
 from vioframe.errors import DataError
 from vioframe.geometry import se3, so3
 from vioframe.trajectory_io import read_times, read_trajectory
-from vioframe.types import Camera, ImuBlock, ImuNoise, SensorRig, Trajectory
-from vioframe_recordings.folders import find_images, find_root, names_in
+from vioframe.types import Camera, ImuBlock, ImuNoise, Trajectory
+from vioframe_recordings.folders import FolderDataset, find_images, names_in
 from vioframe_recordings.kitti_calibration import (
     NOMINAL_RATE_HZ,
     DriveDate,
@@ -37,7 +36,7 @@ from vioframe_recordings.stored import StoredRecording, check_first_images
 SAMPLES_PER_FRAME = 10
 
 
-class KittiDataset(Dataset):
+class KittiDataset(FolderDataset):
     """Odometry sequences; the options are those of ``conf/dataset/kitti.yaml``, with their meaning.
 
     The world has its origin where the vehicle is at frame 0, x along its heading there, and z up as the
@@ -62,13 +61,16 @@ class KittiDataset(Dataset):
         accel_noise: float = 2e-2,
         accel_walk: float = 1e-3,
     ) -> None:
-        self.camera_count = check_camera_count(cameras)
-        self.selection = FrameSelection(every=every, start_s=start_s, duration_s=duration_s)
-        self.root = find_root(root, "kitti")
-        self.images = images
+        super().__init__(
+            key="kitti",
+            root=root,
+            images=images,
+            cameras=cameras,
+            selection=FrameSelection(every=every, start_s=start_s, duration_s=duration_s),
+            camera_delay_s=camera_delay_s,
+            gravity=gravity,
+        )
         self.color = color
-        self.camera_delay_ns = round(camera_delay_s * NANOSECONDS)
-        self.gravity = gravity
         self.noise = ImuNoise(
             gyro_noise=gyro_noise,
             gyro_walk=gyro_walk,
@@ -130,18 +132,12 @@ class KittiDataset(Dataset):
         )
         findings += found
         paths = [[files[i] for i in kept] for files in paths]
-        rig_cameras = cameras[: self.camera_count]
+        rig = self._rig(cameras, noise)
         if self.images:
-            check_first_images(paths, rig_cameras, f"recording day {drive.date}", color=self.color)
+            check_first_images(paths, rig.cameras, f"recording day {drive.date}", color=self.color)
         return StoredRecording(
             name=sequence,
-            rig=SensorRig(
-                cameras=rig_cameras,
-                imu=noise,
-                gravity=self.gravity,
-                camera_delay_ns=self.camera_delay_ns,
-                has_images=self.images,
-            ),
+            rig=rig,
             imu=imu,
             frame_stamps_ns=times_ns[kept],
             image_paths=paths,

@@ -11,13 +11,12 @@ from typing import Literal, get_args
 import numpy as np
 
 from vioframe.checks import Stamps
-from vioframe.conventions import NANOSECONDS
 from vioframe.data import agreement, screening
 from vioframe.data.recording import Finding
-from vioframe.data.selection import FrameSelection, as_names, check_camera_count, choose_frames
+from vioframe.data.selection import FrameSelection, as_names, choose_frames
 from vioframe.errors import ConfigError, DataError
-from vioframe.types import Camera, ImuBlock, ImuNoise, SensorRig
-from vioframe_recordings.folders import find_images, find_root
+from vioframe.types import Camera, ImuBlock, ImuNoise
+from vioframe_recordings.folders import find_images
 from vioframe_recordings.gaps import GapPolicy, GapTreatment, PartedDataset
 from vioframe_recordings.kitti_calibration import NOMINAL_RATE_HZ, raw_cameras, rectified_cameras, sample_rate_hz
 from vioframe_recordings.kitti_inertial import Disorder, MissingAccel, Packets, read_date_stamps, read_klt, read_oxts
@@ -60,17 +59,19 @@ class KittiRawDataset(PartedDataset):
         _check_choice("imu", imu, get_args(InertialSource))
         _check_choice("missing_accel", missing_accel, get_args(MissingAccel))
         _check_choice("disorder", disorder, get_args(Disorder))
-        self.camera_count = check_camera_count(cameras)
-        self.selection = FrameSelection(every=every, start_s=start_s, duration_s=duration_s)
-        treatment = GapTreatment(policy=gap_policy, max_gap_s=max_gap_s, max_fill_s=max_fill_s)
-        self.root = find_root(root, "kitti_raw")
-        self.images = images
+        super().__init__(
+            key="kitti_raw",
+            root=root,
+            images=images,
+            cameras=cameras,
+            selection=FrameSelection(every=every, start_s=start_s, duration_s=duration_s),
+            camera_delay_s=camera_delay_s,
+            gravity=gravity,
+        )
         self.color = color
         self.imu_source = imu
         self.missing_accel = missing_accel
         self.disorder = disorder
-        self.camera_delay_ns = round(camera_delay_s * NANOSECONDS)
-        self.gravity = gravity
         self.noise = ImuNoise(
             gyro_noise=gyro_noise,
             gyro_walk=gyro_walk,
@@ -78,7 +79,8 @@ class KittiRawDataset(PartedDataset):
             accel_walk=accel_walk,
             rate_hz=NOMINAL_RATE_HZ,
         )
-        super().__init__(as_names(sequence) or self._all_sequences(), treatment)
+        self.gap_treatment = GapTreatment(policy=gap_policy, max_gap_s=max_gap_s, max_fill_s=max_fill_s)
+        self._chosen = as_names(sequence) or self._all_sequences()
 
     def open(self, sequence: str) -> StoredRecording:
         """Open and check one drive.
@@ -104,20 +106,14 @@ class KittiRawDataset(PartedDataset):
         findings += found
         paths = [[files[i] for i in kept] for files in paths]
         cameras = self._cameras(name, findings)
-        rig_cameras = cameras[: self.camera_count]
+        rig = self._rig(cameras, noise)
         if self.images:
             calibration = str(self.root / name[:10] / "calib_cam_to_cam.txt")
-            check_first_images(paths, rig_cameras, calibration, color=self.color)
+            check_first_images(paths, rig.cameras, calibration, color=self.color)
             findings.append(_finding("good", "images", f"{len(kept)} × {len(paths)}, as calibrated"))
         return StoredRecording(
             name=sequence,
-            rig=SensorRig(
-                cameras=rig_cameras,
-                imu=noise,
-                gravity=self.gravity,
-                camera_delay_ns=self.camera_delay_ns,
-                has_images=self.images,
-            ),
+            rig=rig,
             imu=imu,
             frame_stamps_ns=stamps_ns[kept],
             image_paths=paths,

@@ -51,6 +51,17 @@ def check_camera_count(cameras: int) -> int:
     return cameras
 
 
+def check_gravity(gravity: float) -> float:
+    """``dataset.gravity``, m/s².
+
+    Raises:
+        ConfigError: not positive.
+    """
+    if not gravity > 0.0:
+        raise ConfigError(f"dataset.gravity must be positive, got {gravity}")
+    return gravity
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameSelection:
     """The options ``dataset.every``, ``dataset.start_s`` and ``dataset.duration_s``.
