@@ -1,7 +1,10 @@
 """The doctor: what it finds, what it prints, and when it is not satisfied."""
 
 import io
+import subprocess
+import sys
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -129,3 +132,29 @@ def test_what_is_bad_comes_first() -> None:
     ]
     text = printed([("ward", findings)])
     assert text.index("broken") < text.index("odd") < text.index("fine")
+
+
+def doctor(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "vioframe", "task=doctor", *options],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+
+
+def test_a_good_recording_leaves_nothing_behind_and_status_0(tmp_path: Path) -> None:
+    done = doctor(tmp_path, "dataset=simulated", "dataset.duration_s=0.5", "rig=blind")
+    assert done.returncode == 0, done.stderr
+    assert "1 sequence: 0 bad" in done.stdout
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_without_recordings_is_one_sentence_and_status_1(tmp_path: Path) -> None:
+    done = doctor(tmp_path, "dataset=euroc", "dataset.root=.")
+    assert done.returncode == 1
+    (sentence,) = done.stderr.splitlines()
+    assert sentence.startswith("ERROR: .: no sequence here") and "dataset.root" in sentence
+    assert not list(tmp_path.iterdir())
