@@ -7,25 +7,23 @@ and real inertial noise are had where the images themselves are too large to shi
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
-from vioframe.checks import Array, Stamps
+from vioframe.checks import Array
 from vioframe.conventions import NANOSECONDS
 from vioframe.data import agreement
 from vioframe.data.recording import Dataset, Finding, Recording
 from vioframe.data.simulator.cameras import CameraSettings
 from vioframe.data.simulator.degrade import Degradations
+from vioframe.data.simulator.drawn import DrawnRecording
 from vioframe.data.simulator.families import Place, PlannedMotion
 from vioframe.data.simulator.fit import fit_spline, longest_covered
-from vioframe.data.simulator.imu import BlockCutter, ImuSettings, InertialSensor, exact_imu, join_stamps
+from vioframe.data.simulator.imu import ImuSettings, InertialSensor, join_stamps
 from vioframe.data.simulator.spline import MotionState, SplineMotion
 from vioframe.errors import ConfigError, DataError
-from vioframe.types import Frame, ImuBlock, Packet, SensorRig, Trajectory
-
-if TYPE_CHECKING:
-    from vioframe.data.simulator.imaging import Imager
+from vioframe.types import Frame, ImuBlock, SensorRig, Trajectory
 
 ImuSource = Literal["recorded", "simulated"]
 PlaceChoice = Literal["auto", "room", "hall", "corridor", "street"]
@@ -168,7 +166,7 @@ class ReplayDataset(Dataset):
         return "hall" if extent[2] > 2.0 or extent[:2].max() > 10.0 else "room"
 
 
-class ReplayRecording(Recording):
+class ReplayRecording(DrawnRecording):
     """One recording drawn anew; made by :class:`ReplayDataset`.
 
     Attributes:
@@ -201,83 +199,30 @@ class ReplayRecording(Recording):
         degradations: Degradations,
         seed: int,
     ) -> None:
-        self.name = source.name
-        self.motion = plan.motion
-        self._source = source
-        self._rig = rig
-        self._plan = plan
-        self._origin_ns = origin_ns
-        self._span_ns = begin_ns, end_ns
-        self._simulated = simulated
-        self._camera = camera
-        self._degradations = degradations
-        self._seed = seed
-        self._imager: Imager | None = None
         # With a rolling shutter the last row, too, must lie on the motion.
         readout_ns = round(camera.rolling_shutter_s * NANOSECONDS)
-        arrivals = [
-            packet.stamp_ns + rig.camera_delay_ns for packet in source.packets() if isinstance(packet, Frame)
-        ]
+        arrivals = [packet.stamp_ns + rig.camera_delay_ns for packet in source.packets() if isinstance(packet, Frame)]
         stamps = np.array(arrivals, dtype=np.int64)
-        stamps = stamps[(stamps >= begin_ns) & (stamps <= end_ns - readout_ns)]
-        kept = ~degradations.dropped(len(stamps), seed)
-        self._dropped = int(np.count_nonzero(~kept))
-        self._frames_ns: Stamps = stamps[kept]
-        if len(self._frames_ns) < 2:
+        super().__init__(
+            name=source.name,
+            rig=rig,
+            plan=plan,
+            origin_ns=origin_ns,
+            frames_ns=stamps[(stamps >= begin_ns) & (stamps <= end_ns - readout_ns)],
+            camera=camera,
+            degradations=degradations,
+            seed=seed,
+            world_seed=seed,
+            duration_s=plan.motion.duration_s,
+        )
+        self._source = source
+        self._span_ns = begin_ns, end_ns
+        self._simulated = simulated
+        if self.frame_count < 2:
             raise DataError(
                 f"{source.name}: fewer than two frames lie within the replayed part of the ground truth "
                 f"({begin_ns}…{end_ns} ns): check dataset.start_s and dataset.duration_s"
             )
-
-    @property
-    def rig(self) -> SensorRig:
-        """Calibration of the source, with the cameras that are drawn."""
-        return self._rig
-
-    @property
-    def frame_count(self) -> int:
-        """Number of frames, without the dropped ones."""
-        return len(self._frames_ns)
-
-    @property
-    def frame_stamps_ns(self) -> Stamps:
-        """Instants (N,) at which the frames see the world, IMU clock."""
-        return self._frames_ns
-
-    @property
-    def duration_s(self) -> float:
-        """Seconds from the first to the last frame."""
-        return float(self._frames_ns[-1] - self._frames_ns[0]) / NANOSECONDS
-
-    @property
-    def imager(self) -> "Imager":
-        """Draws the frames; made when first asked for."""
-        if self._imager is None:
-            from vioframe.data.simulator.imaging import Imager
-
-            self._imager = Imager(
-                plan=self._plan,
-                cameras=self._rig.cameras,
-                settings=self._camera,
-                degradations=self._degradations,
-                seed=self._seed,
-                world_seed=self._seed,
-                duration_s=self.motion.duration_s,
-            )
-        return self._imager
-
-    def elapsed_s(self, stamps_ns: Stamps | int) -> Array:
-        """Time (N,) in s on the motion of stamps on the IMU clock."""
-        return np.asarray(stamps_ns - self._origin_ns) / NANOSECONDS
-
-    def packets(self) -> Iterator[Packet]:
-        """Stream the replayed part: an image arrives with the first sample at or after it."""
-        cutter = BlockCutter(self._blocks())
-        for stamp_ns in self._frames_ns:
-            yield from cutter.until(int(stamp_ns))
-            images = self.imager.images(float(self.elapsed_s(stamp_ns))) if self._camera.images else ()
-            yield Frame(stamp_ns=int(stamp_ns) - self._rig.camera_delay_ns, images=images)
-        yield from cutter.until(None)
 
     def _blocks(self) -> Iterator[ImuBlock]:
         begin_ns, end_ns = self._span_ns
@@ -291,9 +236,7 @@ class ReplayRecording(Recording):
             if inside.all():
                 yield packet
             elif inside.any():
-                yield ImuBlock(
-                    stamps_ns=packet.stamps_ns[inside], gyro=packet.gyro[inside], accel=packet.accel[inside]
-                )
+                yield ImuBlock(stamps_ns=packet.stamps_ns[inside], gyro=packet.gyro[inside], accel=packet.accel[inside])
 
     def _sensor(self, settings: ImuSettings) -> InertialSensor:
         begin_ns, end_ns = self._span_ns
@@ -305,11 +248,6 @@ class ReplayRecording(Recording):
             duration_s=(end_ns - begin_ns) / NANOSECONDS,
             seed=self._seed,
         )
-
-    def exact_imu(self, stamps_ns: Stamps) -> ImuBlock:
-        """What a perfect sensor on the fitted motion would read at these stamps."""
-        gyro, accel = exact_imu(self.motion, self.elapsed_s(stamps_ns), self._rig.gravity)
-        return ImuBlock(stamps_ns=stamps_ns, gyro=gyro, accel=accel)
 
     def ground_truth(self) -> Trajectory:
         """The fitted motion at 200 Hz and at every frame."""
