@@ -16,16 +16,11 @@ import pytest
 from rich.console import Console
 
 from vioframe.sweep import conclude, failed_jobs, write_status
-from vioframe.sweep_summary import (
-    COLUMNS,
-    JobResult,
-    collect,
-    draw_chart,
-    markdown_table,
-    print_table,
-    summarise,
-    write_files,
-)
+from vioframe.sweep.chart import draw_chart
+from vioframe.sweep.files import write_files
+from vioframe.sweep.jobs import JobResult, collect
+from vioframe.sweep.summary import COLUMNS, summarise
+from vioframe.sweep.table import markdown_table, print_table
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 

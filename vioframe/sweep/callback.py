@@ -1,36 +1,23 @@
-"""Multirun: one parent record above the jobs' records, and one summary of what became of each job.
+"""What happens when a sweep and its jobs start and end."""
 
-A job leaves three files in its folder: ``job.json`` (written here when it starts: number and overrides),
-``metrics.json`` and ``status.json`` (``{"status": "finished"|"failed"|"interrupted", "error": sentence}``, by
-the task). They are all that the summary reads, so that it is the same for jobs of this process, of other
-processes and of a cluster, and for jobs that died without a word.
-"""
-
-import json
 import logging
 import os
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra.experimental.callback import Callback
 
+from vioframe.sweep.jobs import JobResult, collect, write_job, write_status
+from vioframe.sweep.plan import composes, label_job, plan_jobs, read_arguments, tracker_options
+
 if TYPE_CHECKING:
     from hydra.core.utils import JobReturn
     from omegaconf import DictConfig
 
-    from vioframe.sweep_summary import JobResult
     from vioframe.tracking import Tracker
 
 log = logging.getLogger(__name__)
-
-JOB_FILE = "job.json"
-STATUS_FILE = "status.json"
-METRICS_FILE = "metrics.json"
-
-_VALIDATED_JOBS = 20
-"""How many jobs are composed before anything is recorded, to let a misspelt option answer at once."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -40,7 +27,7 @@ class _Sweep:
     folder: Path
     planned: list[list[str]]
     tracker: "Tracker"
-    failed: "list[JobResult] | None" = None
+    failed: list[JobResult] | None = None
     environment: dict[str, str] = field(default_factory=dict)
 
 
@@ -70,13 +57,13 @@ class SweepCallback(Callback):
 
         # Resolved on the config itself: it keeps the moment that ${now:...} stands for.
         folder = Path(str(config.hydra.sweep.dir)).absolute()
-        arguments = _arguments(config)
-        self._swept, planned = _plan(arguments)
-        if not _composes(config, planned):
+        arguments = read_arguments(config)
+        self._swept, planned = plan_jobs(arguments)
+        if not composes(config, planned):
             return
         tracker: Tracker = NullTracker()
         try:
-            options = _tracker_options(config)
+            options = tracker_options(config)
             if options is not None:
                 tracker = MlflowTracker(**options)
                 swept = [text for text in arguments if text.partition("=")[0] in self._swept]
@@ -102,13 +89,8 @@ class SweepCallback(Callback):
         overrides = [str(text) for text in config.hydra.overrides.task]
         # A pool's worker may have been started by an earlier sweep, with that one's environment.
         os.environ.update(self._environment)
-        os.environ[RUN_NAME_VARIABLE] = _label(overrides, self._swept)
-        entry = {
-            "job": int(config.hydra.job.num),
-            "overrides": overrides,
-            "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        }
-        _write_json(Path(config.hydra.runtime.output_dir) / JOB_FILE, entry)
+        os.environ[RUN_NAME_VARIABLE] = label_job(overrides, self._swept)
+        write_job(Path(config.hydra.runtime.output_dir), int(config.hydra.job.num), overrides)
 
     def on_job_end(self, config: "DictConfig", job_return: "JobReturn", **kwargs: Any) -> None:
         """In the job's process: where the task left no status, leave one."""
@@ -131,27 +113,7 @@ class SweepCallback(Callback):
         conclude()
 
 
-def write_status(folder: Path, status: str, error: str = "") -> None:
-    """Leave word of how a job ended; the first word stands.
-
-    Args:
-        folder: of the job.
-        status: ``finished``, ``failed`` or ``interrupted``.
-        error: one sentence.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    if not (folder / STATUS_FILE).exists():
-        _write_json(folder / STATUS_FILE, {"status": status, "error": error})
-
-
-def failed_jobs(sweep_dir: Path | str) -> "list[JobResult]":
-    """Return the jobs of a sweep that did not finish, those that died without a word among them."""
-    from vioframe.sweep_summary import collect
-
-    return [job for job in collect(Path(sweep_dir)) if job.status != "finished"]
-
-
-def conclude(*, interrupted: bool = False) -> "list[JobResult]":
+def conclude(*, interrupted: bool = False) -> list[JobResult]:
     """Close the sweep of this process: print its table, write its files, finish its parent record.
 
     Called when Hydra ends a multirun, and again by ``main``, which catches a multirun that broke off (then
@@ -167,7 +129,9 @@ def conclude(*, interrupted: bool = False) -> "list[JobResult]":
         return []
     if _sweep.failed is not None:
         return _sweep.failed
-    from vioframe.sweep_summary import collect, markdown_table, print_table, summarise, write_files
+    from vioframe.sweep.files import write_files
+    from vioframe.sweep.summary import summarise
+    from vioframe.sweep.table import markdown_table, print_table
     from vioframe.tracking import MlflowTracker
 
     jobs = collect(_sweep.folder, _sweep.planned)
@@ -199,84 +163,3 @@ def _is_multirun(config: "DictConfig") -> bool:
     from hydra.types import RunMode
 
     return bool(config.hydra.mode == RunMode.MULTIRUN)
-
-
-def _arguments(config: "DictConfig") -> list[str]:
-    """Return everything a sweeper goes through: its own parameters, then the command line's overrides."""
-    from omegaconf import OmegaConf
-
-    parameters = OmegaConf.select(config, "hydra.sweeper.params") or {}
-    return [f"{key}={value}" for key, value in parameters.items()] + [str(t) for t in config.hydra.overrides.task]
-
-
-def _plan(arguments: list[str]) -> tuple[list[str], list[list[str]]]:
-    """Return the swept keys, and every job's overrides where Hydra's basic sweeper can tell them."""
-    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
-
-    try:
-        parsed = OverridesParser.create().parse_overrides(arguments)
-        swept = [entry.get_key_element() for entry in parsed if entry.is_sweep_override()]
-    except HydraException:
-        # The sweeper is about to say so itself, better.
-        return [], []
-    try:
-        planned = [list(job) for job in BasicSweeper.split_arguments(parsed, None)[0]]
-    except HydraException:
-        # A range of another sweeper, or a glob over a group, which only the sweeper can expand.
-        planned = []
-    return swept, planned
-
-
-def _composes(config: "DictConfig", planned: list[list[str]]) -> bool:
-    """Tell whether the first jobs' configs compose; where not, Hydra's sweeper is about to say why."""
-    from hydra.core.global_hydra import GlobalHydra
-    from hydra.errors import HydraException
-
-    hydra = GlobalHydra.instance().hydra
-    if hydra is None:
-        return True
-    try:
-        for overrides in planned[:_VALIDATED_JOBS]:
-            hydra.config_loader.load_sweep_config(config, overrides)
-    except HydraException:
-        return False
-    return True
-
-
-def _tracker_options(config: "DictConfig") -> dict[str, Any] | None:
-    """Return the options of ``tracker=mlflow``; ``None`` for another tracker, which knows no parents."""
-    import copy
-
-    from hydra.core.hydra_config import HydraConfig
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-
-    from vioframe.errors import ConfigError
-
-    holder = HydraConfig.instance()
-    before = holder.cfg
-    try:
-        # Hydra sets this for jobs only, and ${hydra:...} needs it.
-        holder.set_config(copy.deepcopy(config))
-        node = OmegaConf.select(config, "tracker")
-        if node is None or not OmegaConf.is_dict(node):
-            return None
-        options = OmegaConf.to_container(node, resolve=True)
-    except OmegaConfBaseException as error:
-        raise ConfigError(f"tracker: {str(error).splitlines()[0]}") from error
-    finally:
-        holder.cfg = before
-    if not isinstance(options, dict) or options.pop("_target_", "") != "vioframe.tracking.MlflowTracker":
-        return None
-    return {str(key): value for key, value in options.items()}
-
-
-def _label(overrides: list[str], swept: list[str]) -> str:
-    """Name a job by its swept overrides; by all of them where nothing is known to be swept."""
-    return " ".join([text for text in overrides if text.partition("=")[0] in swept] or overrides)
-
-
-def _write_json(path: Path, entry: dict[str, object]) -> None:
-    path.write_text(json.dumps(entry, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
