@@ -1,1 +1,1 @@
-"""Where packets come from: the abstract recording, and the simulator."""
+"""Where packets come from: the abstract recording, what recordings on disk share, and the simulator."""

@@ -18,9 +18,9 @@ from vioframe.data.recording import Dataset, Finding, Recording
 from vioframe.data.simulator.cameras import CameraSettings
 from vioframe.data.simulator.degrade import Degradations
 from vioframe.data.simulator.drawn import DrawnRecording
-from vioframe.data.simulator.families import Place, PlannedMotion
 from vioframe.data.simulator.fit import fit_spline, longest_covered
 from vioframe.data.simulator.imu import ImuSettings, InertialSensor, join_stamps
+from vioframe.data.simulator.plan import Place, PlannedMotion
 from vioframe.data.simulator.spline import MotionState, SplineMotion
 from vioframe.errors import ConfigError, DataError
 from vioframe.types import Frame, ImuBlock, SensorRig, Trajectory
@@ -131,7 +131,7 @@ class ReplayDataset(Dataset):
             end_ns = min(end_ns, begin_ns + round(self._duration_s * NANOSECONDS))
         step_s = float(np.median(np.diff(covered.stamps_ns))) / NANOSECONDS
         motion = fit_spline(covered, max(self._knot_s, step_s))
-        rig = replace(recording.rig, cameras=cameras[: self._cameras], has_images=self._camera_settings.images)
+        rig = replace(recording.rig, cameras=cameras[: self._cameras])
         settings = self._imu_settings
         if settings is None:
             noise = rig.imu
