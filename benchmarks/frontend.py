@@ -1,6 +1,6 @@
 """The KLT front end and the geometric odometries on rendered images: accuracy, covariance, time.
 
-    python benchmarks/frontend.py [--vo local_map] [--family walk] [--seed 0] [--seconds 20] [--no-gyro] [--plot out.png]
+    OMP_NUM_THREADS=1 python benchmarks/frontend.py [--vo local_map] [--family walk] [--seed 0] [--seconds 20]
     python benchmarks/frontend.py --vo stereo --family car --seconds 160
     python benchmarks/frontend.py --replay /data/euroc --sequence V1_02_medium --seconds 30
 
@@ -124,7 +124,7 @@ def main() -> None:
     path = float(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=-1).sum())
     rmse = float(np.sqrt(np.mean(np.sum((aligned - true[:, :3, 3]) ** 2, axis=-1))))
     turned = np.degrees(so3.angle(told[-1, :3, :3].T @ true[-1, :3, :3]))
-    print(f"  path {path:.1f} m, RMSE {rmse:.4f} m = {100 * rmse / path:.2f} %, scale {scale:.4f}, rotation {turned:.2f}°")
+    print(f"  path {path:.1f} m, RMSE {rmse:.4f} m = {100 * rmse / path:.2f} %, scale {scale:.4f}, turn {turned:.2f}°")
     nees = []
     for motion, step in steps:
         step[:3, 3] /= scale
