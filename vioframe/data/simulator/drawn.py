@@ -12,8 +12,8 @@ from vioframe.conventions import NANOSECONDS
 from vioframe.data.recording import Recording
 from vioframe.data.simulator.cameras import CameraSettings
 from vioframe.data.simulator.degrade import Degradations
-from vioframe.data.simulator.families import PlannedMotion
 from vioframe.data.simulator.imu import BlockCutter, exact_imu
+from vioframe.data.simulator.plan import PlannedMotion
 from vioframe.types import Frame, ImuBlock, Packet, SensorRig
 
 if TYPE_CHECKING:

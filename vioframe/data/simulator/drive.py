@@ -3,7 +3,7 @@
 import numpy as np
 
 from vioframe.checks import Array
-from vioframe.data.simulator.families import PlannedMotion, own_time, rotation_from_angles
+from vioframe.data.simulator.plan import PlannedMotion, own_time, rotation_from_angles, start_rest
 from vioframe.data.simulator.spline import SplineMotion, control_times
 
 BODY_HEIGHT_M = 0.93
@@ -21,8 +21,7 @@ def plan_drive(rng: np.random.Generator, duration_s: float, standstill_s: float)
     path = _path(rng, cruise * duration_s + 200.0)
     distance = _distance(path, cruise, duration_s + 30.0)
     times = control_times(duration_s, _KNOT_S)
-    rests = [(-10.0, standstill_s)] if standstill_s > 0.0 else []
-    travelled = np.interp(own_time(times, rests, _KNOT_S), np.arange(len(distance)) * 0.02, distance)
+    travelled = np.interp(own_time(times, start_rest(standstill_s), _KNOT_S), np.arange(len(distance)) * 0.02, distance)
     if standstill_s == 0.0:
         # Already under way, as most recordings of cars are.
         lead = int(np.searchsorted(distance, 60.0))
@@ -32,9 +31,7 @@ def plan_drive(rng: np.random.Generator, duration_s: float, standstill_s: float)
     position = np.stack([x, y, np.full_like(x, BODY_HEIGHT_M)], axis=-1)
     zero = np.zeros_like(x)
     return PlannedMotion(
-        motion=SplineMotion(
-            knot_s=_KNOT_S, positions=position, rotations=rotation_from_angles(heading, zero, zero)
-        ),
+        motion=SplineMotion(knot_s=_KNOT_S, positions=position, rotations=rotation_from_angles(heading, zero, zero)),
         place="street",
     )
 

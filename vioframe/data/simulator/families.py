@@ -13,16 +13,15 @@ import numpy as np
 
 from vioframe.checks import Array
 from vioframe.conventions import GRAVITY
+from vioframe.data.simulator.drive import plan_drive
+from vioframe.data.simulator.plan import Place, PlannedMotion, own_time, rotation_from_angles, start_rest
 from vioframe.data.simulator.spline import SplineMotion, control_times
 from vioframe.errors import ConfigError
-from vioframe.geometry import so3
 
-Place = Literal["room", "hall", "corridor", "street"]
 Kit = Literal["euroc", "kitti"]
 
 # Room-scale motions have control poses ten times a second, which carries the two steps a second of a walk.
 _KNOT_S = 0.1
-_RAMP_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,44 +41,6 @@ class FamilyTraits:
     standstill_s: float = 2.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PlannedMotion:
-    """A motion and the world it needs.
-
-    Attributes:
-        motion: of the body.
-        place: kind of world.
-    """
-
-    motion: SplineMotion
-    place: Place
-
-
-def rotation_from_angles(yaw: Array, pitch: Array, roll: Array) -> Array:
-    """R_world_body (N, 3, 3) for x forward, y left, z up: yaw about z, then nose *down* by ``pitch``, then roll."""
-    zero = np.zeros_like(yaw)
-    turn = so3.exp(np.stack([zero, zero, yaw], -1))
-    nod = so3.exp(np.stack([zero, pitch, zero], -1))
-    lean = so3.exp(np.stack([roll, zero, zero], -1))
-    return turn @ nod @ lean
-
-
-def own_time(t_s: Array, rests: list[tuple[float, float]], knot_s: float = _KNOT_S) -> Array:
-    """Time (N,) that stops during the rests (from, to) in s, and slows and speeds up smoothly around them."""
-    grid = np.arange(min(t_s.min(), 0.0) - 1.0, t_s.max() + 1.0, 0.01)
-    rate = np.ones_like(grid)
-    for start, end in rests:
-        # The spline looks three knots ahead and behind, so it rests only well inside a constant stretch.
-        before = np.clip((start - 3.0 * knot_s - grid) / _RAMP_S, 0.0, 1.0)
-        after = np.clip((grid - (end + 3.0 * knot_s)) / _RAMP_S, 0.0, 1.0)
-        gate = np.maximum(before, after)
-        rate = np.minimum(rate, gate * gate * (3.0 - 2.0 * gate))
-    elapsed = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * 0.01)])
-    elapsed -= np.interp(0.0, grid, elapsed)
-    own: Array = np.interp(t_s, grid, elapsed)
-    return own
-
-
 def _sway(rng: np.random.Generator, time: Array, amplitude: float, low_hz: float, high_hz: float) -> Array:
     """Three incommensurate waves (N,) between two frequencies, at most ``amplitude`` high."""
     frequencies = rng.uniform(low_hz, high_hz, 3)
@@ -88,10 +49,6 @@ def _sway(rng: np.random.Generator, time: Array, amplitude: float, low_hz: float
     waves = np.sin(2.0 * np.pi * frequencies * time[:, None] + phases)
     total: Array = waves @ weights
     return total
-
-
-def _start_rest(standstill_s: float) -> list[tuple[float, float]]:
-    return [(-10.0, standstill_s)] if standstill_s > 0.0 else []
 
 
 def _loop(
@@ -137,27 +94,27 @@ def _held_walk(rng: np.random.Generator, time: Array) -> tuple[Array, Array]:
 
 def _walk(rng: np.random.Generator, duration_s: float, standstill_s: float) -> PlannedMotion:
     times = control_times(duration_s, _KNOT_S)
-    position, rotation = _held_walk(rng, own_time(times, _start_rest(standstill_s)))
+    position, rotation = _held_walk(rng, own_time(times, start_rest(standstill_s), _KNOT_S))
     return PlannedMotion(motion=SplineMotion(knot_s=_KNOT_S, positions=position, rotations=rotation), place="room")
 
 
 def _standing(rng: np.random.Generator, duration_s: float, standstill_s: float) -> PlannedMotion:
     """A long rest, then a walk with halts."""
     times = control_times(duration_s, _KNOT_S)
-    rests = _start_rest(standstill_s)
+    rests = start_rest(standstill_s)
     halt = standstill_s + rng.uniform(6.0, 9.0)
     while halt < duration_s:
         length = rng.uniform(2.0, 5.0)
         rests.append((halt, halt + length))
         halt += length + rng.uniform(6.0, 9.0)
-    position, rotation = _held_walk(rng, own_time(times, rests))
+    position, rotation = _held_walk(rng, own_time(times, rests, _KNOT_S))
     return PlannedMotion(motion=SplineMotion(knot_s=_KNOT_S, positions=position, rotations=rotation), place="room")
 
 
 def _rotation(rng: np.random.Generator, duration_s: float, standstill_s: float) -> PlannedMotion:
     """Turning on the spot: the body's origin does not move."""
     times = control_times(duration_s, _KNOT_S)
-    time = own_time(times, _start_rest(standstill_s))
+    time = own_time(times, start_rest(standstill_s), _KNOT_S)
     position = np.broadcast_to(np.array([0.0, 0.0, 1.5]), (len(time), 3)).copy()
     rotation = rotation_from_angles(
         rng.uniform(-np.pi, np.pi) + rng.choice([-1.0, 1.0]) * 0.25 * time + _sway(rng, time, 0.8, 0.05, 0.2),
@@ -170,7 +127,7 @@ def _rotation(rng: np.random.Generator, duration_s: float, standstill_s: float) 
 def _drone(rng: np.random.Generator, duration_s: float, standstill_s: float) -> PlannedMotion:
     """A multirotor that leans into its accelerations, at 2 to 4 m/s, from a stand."""
     times = control_times(duration_s, _KNOT_S)
-    time = own_time(times, _start_rest(standstill_s))
+    time = own_time(times, start_rest(standstill_s), _KNOT_S)
     pace = rng.uniform(0.95, 1.15)
     phases = rng.uniform(0.0, 2.0 * np.pi, 6)
     hand = rng.choice([-1.0, 1.0])
@@ -190,9 +147,9 @@ def _drone(rng: np.random.Generator, duration_s: float, standstill_s: float) -> 
     # Acceleration in real time, so that the vehicle is level while it stands.
     step = 0.02
     acceleration = (
-        fly(own_time(times + step, _start_rest(standstill_s)))
+        fly(own_time(times + step, start_rest(standstill_s), _KNOT_S))
         - 2.0 * position
-        + fly(own_time(times - step, _start_rest(standstill_s)))
+        + fly(own_time(times - step, start_rest(standstill_s), _KNOT_S))
     ) / step**2
     yaw = phases[3] + hand * 0.35 * time + _sway(rng, time, 0.7, 0.05, 0.15)
     ahead = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1)
@@ -207,7 +164,7 @@ def _drone(rng: np.random.Generator, duration_s: float, standstill_s: float) -> 
 def _corridor(rng: np.random.Generator, duration_s: float, standstill_s: float) -> PlannedMotion:
     """To the end of a corridor and back, again and again, with a turn on the spot at each end."""
     times = control_times(duration_s, _KNOT_S)
-    time = own_time(times, _start_rest(standstill_s))
+    time = own_time(times, start_rest(standstill_s), _KNOT_S)
     length, speed, turn_s = rng.uniform(32.0, 40.0), rng.uniform(1.2, 1.4), 3.0
     leg_s = length / speed + turn_s
     leg = np.floor(time / leg_s)
@@ -239,14 +196,6 @@ def _corridor(rng: np.random.Generator, duration_s: float, standstill_s: float) 
     return PlannedMotion(motion=SplineMotion(knot_s=_KNOT_S, positions=position, rotations=rotation), place="corridor")
 
 
-def _car(rng: np.random.Generator, duration_s: float, standstill_s: float) -> PlannedMotion:
-    """A car in town."""
-    # Imported here because driving is made of this module's pieces.
-    from vioframe.data.simulator.drive import plan_drive
-
-    return plan_drive(rng, duration_s, standstill_s)
-
-
 Builder = Callable[[np.random.Generator, float, float], PlannedMotion]
 
 FAMILIES: dict[str, tuple[FamilyTraits, Builder]] = {
@@ -255,7 +204,7 @@ FAMILIES: dict[str, tuple[FamilyTraits, Builder]] = {
     "rotation": (FamilyTraits(place="room"), _rotation),
     "drone": (FamilyTraits(place="hall"), _drone),
     "corridor": (FamilyTraits(place="corridor", duration_s=70.0), _corridor),
-    "car": (FamilyTraits(place="street", kit="kitti", duration_s=110.0), _car),
+    "car": (FamilyTraits(place="street", kit="kitti", duration_s=110.0), plan_drive),
 }
 """Name → traits and builder (generator, duration_s, standstill_s)."""
 

@@ -8,7 +8,7 @@ from vioframe.checks import Array
 from vioframe.data.simulator.cameras import CameraSettings
 from vioframe.data.simulator.degrade import Degradations
 from vioframe.data.simulator.drive import BODY_HEIGHT_M
-from vioframe.data.simulator.families import PlannedMotion
+from vioframe.data.simulator.plan import PlannedMotion
 from vioframe.data.simulator.render import Renderer, View
 from vioframe.data.simulator.rooms import PATH_STEP_S, build_room
 from vioframe.data.simulator.street import build_street

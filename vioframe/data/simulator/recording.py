@@ -9,8 +9,8 @@ from vioframe.data.recording import Finding
 from vioframe.data.simulator.cameras import CameraSettings
 from vioframe.data.simulator.degrade import Degradations
 from vioframe.data.simulator.drawn import DrawnRecording
-from vioframe.data.simulator.families import PlannedMotion
 from vioframe.data.simulator.imu import ImuSamples, ImuSettings, InertialSensor, join_stamps
+from vioframe.data.simulator.plan import PlannedMotion
 from vioframe.types import ImuBlock, SensorRig, Trajectory
 
 START_NS = 1_700_000_000 * NANOSECONDS
