@@ -21,7 +21,6 @@ from vioframe.data.simulator.drawn import DrawnRecording
 from vioframe.data.simulator.fit import fit_spline, longest_covered
 from vioframe.data.simulator.imu import ImuSettings, InertialSensor, join_stamps
 from vioframe.data.simulator.plan import Place, PlannedMotion
-from vioframe.data.simulator.plan import Place, PlannedMotion
 from vioframe.data.simulator.spline import MotionState, SplineMotion
 from vioframe.errors import ConfigError, DataError
 from vioframe.types import Frame, ImuBlock, SensorRig, Trajectory
