@@ -53,6 +53,15 @@ def _check_not_negative(group: str, **values: float) -> None:
             raise ConfigError(f"fuser.{group}.{name} must not be negative, got {value}")
 
 
+def _check_gate(group: str, probability: float) -> None:
+    if not 0.0 < probability <= 1.0:
+        raise ConfigError(f"fuser.{group}.gate_probability must be in (0, 1], got {probability}; 1 means no gate")
+
+
+def _gate(probability: float, degrees: int) -> float:
+    return chi_square_limit(probability, degrees) if probability < 1.0 else float("inf")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InertialOptions:
     """How far the inertial increments are believed.
@@ -151,14 +160,11 @@ class VisualOptions:
                 "fuser.visual.translation_sigma and translation_ratio are both 0: "
                 "a motion without error cannot be fused"
             )
-        if not 0.0 < self.gate_probability <= 1.0:
-            raise ConfigError(
-                f"fuser.visual.gate_probability must be in (0, 1], got {self.gate_probability}; 1 means no gate"
-            )
+        _check_gate("visual", self.gate_probability)
 
     def gate(self, degrees: int) -> float:
         """Largest χ² of a residual with this many degrees of freedom that is used."""
-        return chi_square_limit(self.gate_probability, degrees) if self.gate_probability < 1.0 else np.inf
+        return _gate(self.gate_probability, degrees)
 
     def covariance_of(self, pose: RelativePose) -> Array:
         """Covariance (6, 6) to use, in the unit of the VO."""
@@ -182,6 +188,8 @@ class StandstillOptions:
         rotation_sigma: rad, over a window.
         position_sigma: m, over a window.
         velocity_sigma: m/s.
+        gate_probability: a rest that is one is measured with this probability. Low, since the samples tell the
+            onset of motion late, and a rest that is missed costs nothing.
     """
 
     enabled: bool = True
@@ -192,6 +200,7 @@ class StandstillOptions:
     rotation_sigma: float = 3e-4
     position_sigma: float = 2e-4
     velocity_sigma: float = 5e-3
+    gate_probability: float = 0.9
 
     def __post_init__(self) -> None:
         _check_positive(
@@ -201,6 +210,7 @@ class StandstillOptions:
             velocity_sigma=self.velocity_sigma,
         )
         _check_not_negative("standstill", speed=self.speed)
+        _check_gate("standstill", self.gate_probability)
 
     def test(self, rig: SensorRig) -> StandstillTest:
         """The test with these limits for a sequence."""
@@ -321,7 +331,7 @@ class LooseFuser(Fuser):
         self._inertial = inertial or InertialOptions()
         self._standstill = standstill or StandstillOptions()
         self._start = start or StartOptions()
-        self._standstill_gate = self._visual.gate(9)
+        self._standstill_gate = _gate(self._standstill.gate_probability, 9)
         self._gap_allowed_ns = round(self._inertial.gap_allowed_s * NANOSECONDS)
         self._ready = False
 
