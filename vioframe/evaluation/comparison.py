@@ -11,7 +11,7 @@ from vioframe.conventions import NANOSECONDS
 from vioframe.errors import MetricError
 from vioframe.evaluation.align import ALIGNMENTS, Alignment, MatchedPoses, Motion, align
 from vioframe.evaluation.metrics import position_errors
-from vioframe.evaluation.plots import STYLE, TRUTH, add_caption, new_figure, plot_path, with_breaks
+from vioframe.evaluation.plots.canvas import STYLE, TRUTH, add_caption, new_figure, plot_path, with_breaks
 from vioframe.evaluation.protocol import EvaluationOptions, describe_association
 from vioframe.types import Trajectory
 
