@@ -39,13 +39,13 @@ _WIDE_KEYS = (
 )
 
 
-def print_rows(rows: Sequence[Row], folder: Path, *, hint: str = "") -> None:
+def print_rows(rows: Sequence[Row], folder: Path, *, hints: Mapping[str, str] | None = None) -> None:
     """Print the results and where they are.
 
     Args:
         rows: one per sequence.
         folder: the output folder.
-        hint: what the tracker has to say, such as where its user interface is.
+        hints: what else there is to see and the command that shows it, by the one word that introduces it.
     """
     from rich.console import Console
 
@@ -54,10 +54,10 @@ def print_rows(rows: Sequence[Row], folder: Path, *, hint: str = "") -> None:
         console.print(part)
     console.print(f"results in {folder}", style="bold", soft_wrap=True, highlight=False, markup=False)
     report = folder / "report.html"
-    if report.exists():
-        console.print(f"report     {report}", soft_wrap=True, highlight=False, markup=False)
-    if hint:
-        console.print(hint, soft_wrap=True, highlight=False, markup=False)
+    for label, text in {"report": str(report) if report.exists() else "", **(hints or {})}.items():
+        if text:
+            # As wide as "results in".
+            console.print(f"{label:<10} {text}", soft_wrap=True, highlight=False, markup=False)
 
 
 def render_rows(rows: Sequence[Row], width: int = 120) -> "list[RenderableType]":

@@ -121,8 +121,8 @@ class _Experiment:
         if in_sweep:
             log.info("%s", self.folder)
         else:
-            hints = [self.tracker.hint, "" if self.viewer is None else self.viewer.hint]
-            print_rows(self.rows, self.folder, hint="\n".join(hint for hint in hints if hint))
+            watch = "" if self.viewer is None else self.viewer.hint
+            print_rows(self.rows, self.folder, hints={"compare": self.tracker.hint, "watch": watch})
         if self._bug is not None:
             raise self._bug
         if any(run.interrupted for run in self.runs):

@@ -15,7 +15,7 @@ from vioframe.evaluation import EvaluationOptions, SequenceRun
 from vioframe.evaluation.plots import draw_run
 from vioframe.evaluation.report import folder_names, write_outputs
 from vioframe.evaluation.rows import evaluate_run
-from vioframe.evaluation.table import render_rows
+from vioframe.evaluation.table import print_rows, render_rows
 from vioframe.evaluation.wording import significant
 from vioframe.trajectory_io import read_trajectory
 
@@ -145,6 +145,18 @@ def test_undefined_is_printed_as_undefined_with_its_reason() -> None:
     assert re.search(r"t_rel \(KITTI\) +undefined", text)
     assert "no segment of 100 m fits" in text
     assert re.search(r"completion +80\.50 +%", text)
+
+
+def test_the_last_lines_say_where_everything_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    hints = {"compare": "mlflow ui", "watch": ""}
+    print_rows([], tmp_path, hints=hints)
+    assert capsys.readouterr().out.splitlines() == [f"results in {tmp_path}", "compare    mlflow ui"]
+    (tmp_path / "report.html").touch()
+    print_rows([], tmp_path, hints=hints)
+    assert capsys.readouterr().out.splitlines()[1:] == [
+        f"report     {tmp_path / 'report.html'}",
+        "compare    mlflow ui",
+    ]
 
 
 @pytest.mark.parametrize("width", [60, 80, 120, 200])
