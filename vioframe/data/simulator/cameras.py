@@ -139,6 +139,8 @@ class CameraSettings:
             # Coefficients mean nothing to another model.
             distortion = base.distortion if model == base.model else (0.0,) * (0 if model == "pinhole" else 4)
         size = tuple(int(v) for v in (self.size_px if self.size_px is not None else base.size_px))
+        if len(size) != 2:
+            raise ConfigError(f"dataset.camera.size_px must be (width, height), got {size}")
         intrinsics = [float(v) for v in (self.intrinsics_px if self.intrinsics_px is not None else base.intrinsics_px)]
         if self.intrinsics_px is None and size != base.size_px:
             # The same field of view on another sensor; pixel centres are at whole numbers, hence the halves.
@@ -160,13 +162,11 @@ class CameraSettings:
                     model=model,  # type: ignore[arg-type]  # Camera refuses any other name
                     intrinsics_px=np.array(intrinsics),
                     distortion=np.array([float(v) for v in distortion]),
-                    size_px=size,  # type: ignore[arg-type]  # checked below
+                    size_px=size,
                     T_body_cam=T_body_cam @ shift,
                 )
             except ShapeError as error:
                 raise ConfigError(f"dataset.camera: {error}") from error
-            if len(size) != 2:
-                raise ConfigError(f"dataset.camera.size_px must be (width, height), got {size}")
             cameras.append(camera)
         return tuple(cameras)
 

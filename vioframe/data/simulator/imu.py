@@ -9,6 +9,7 @@ from vioframe.checks import Array, Stamps
 from vioframe.conventions import NANOSECONDS, gravity_vector
 from vioframe.data.simulator.spline import Motion
 from vioframe.errors import ConfigError
+from vioframe.geometry import so3
 from vioframe.inertial import walk_sigma, white_sigma
 from vioframe.types import ImuBias, ImuBlock, ImuNoise
 
@@ -105,7 +106,8 @@ class ImuSamples:
 
     Attributes:
         block: what the sensor says.
-        gyro_bias: (N, 3) rad/s and accel_bias: (N, 3) m/s², the truth at each sample.
+        gyro_bias: (N, 3) rad/s, the truth at each sample.
+        accel_bias: (N, 3) m/s², the truth at each sample.
     """
 
     block: ImuBlock
@@ -123,8 +125,6 @@ def exact_imu(motion: Motion, t_s: Array, gravity: float) -> tuple[Array, Array]
 
 def _mixing(scale_error: Array, misalignment: Array) -> Array:
     """Matrix (3, 3) from true to measured axes."""
-    from vioframe.geometry import so3
-
     return np.diag(1.0 + scale_error) @ so3.exp(misalignment)
 
 
@@ -170,8 +170,12 @@ class InertialSensor:
     def stream(self) -> Iterator[ImuSamples]:
         """All samples in order, about a second at a time; holes leave them out."""
         s = self._settings
-        gyro_mix = _mixing(_triple("gyro_scale_error", s.gyro_scale_error), _triple("", s.gyro_misalignment))
-        accel_mix = _mixing(_triple("accel_scale_error", s.accel_scale_error), _triple("", s.accel_misalignment))
+        gyro_mix = _mixing(
+            _triple("gyro_scale_error", s.gyro_scale_error), _triple("gyro_misalignment", s.gyro_misalignment)
+        )
+        accel_mix = _mixing(
+            _triple("accel_scale_error", s.accel_scale_error), _triple("accel_misalignment", s.accel_misalignment)
+        )
         bias = self.initial_bias()
         last_gyro_bias, last_accel_bias = bias.gyro, bias.accel
         noise_rng = np.random.default_rng([self._seed, 1])
@@ -204,9 +208,7 @@ class InertialSensor:
             if not keep.any():
                 continue
             yield ImuSamples(
-                block=ImuBlock(
-                    stamps_ns=self._start_ns + since_start_ns[keep], gyro=gyro[keep], accel=accel[keep]
-                ),
+                block=ImuBlock(stamps_ns=self._start_ns + since_start_ns[keep], gyro=gyro[keep], accel=accel[keep]),
                 gyro_bias=gyro_bias[keep],
                 accel_bias=accel_bias[keep],
             )

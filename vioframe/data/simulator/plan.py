@@ -63,4 +63,5 @@ def own_time(t_s: Array, rests: list[tuple[float, float]], knot_s: float) -> Arr
 
 def start_rest(standstill_s: float) -> list[tuple[float, float]]:
     """The rest (from, to) in s before the motion sets out; none where it starts under way."""
+    # From well before zero, where control points lie that shape the first instant.
     return [(-10.0, standstill_s)] if standstill_s > 0.0 else []

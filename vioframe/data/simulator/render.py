@@ -21,7 +21,6 @@ from vioframe.types import Camera
 _WIDEST = np.tan(np.deg2rad(84.0))
 _NEAR_M = 0.02
 _BAND_ROWS = 48
-# Four samples of a pixel, no two in one row or column.
 # OpenCV looks up at most 32767 pixels in a row.
 _SMOOTH_CHUNK = 16_384
 # Four samples of a pixel, no two in one row or column.

@@ -51,7 +51,7 @@ def test_wrong_cameras_are_refused_by_name(options: dict[str, object], said: str
 @pytest.mark.parametrize(
     "options",
     [{"model": "orthographic"}, {"distortion": [0.1]}, {"T_body_cam": [[1.0]]}, {"T_body_cam": np.ones((4, 4))},
-     {"size_px": [0, 10]}, {"intrinsics_px": [1.0]}],
+     {"size_px": [0, 10]}, {"size_px": [752, 480, 1]}, {"intrinsics_px": [1.0]}],
 )  # fmt: skip
 def test_numbers_that_make_no_camera_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(ConfigError, match=r"dataset\.camera"):
