@@ -42,7 +42,8 @@ class MatchedPoses:
 
     Attributes:
         stamps_ns: (M,) of the estimate.
-        T_estimate: (M, 4, 4) and T_truth: (M, 4, 4), each in its own world.
+        T_estimate: (M, 4, 4) T_world_body in the estimate's world.
+        T_truth: (M, 4, 4) T_world_body in the truth's world.
         estimate_index: (M,) which pose of the estimate each one is.
         frames: (M,) number of each pose among ``T_truth_frames``.
         T_truth_frames: (F, 4, 4) the truth at every frame, also those without an estimate, where the two files
@@ -70,7 +71,9 @@ class Motion:
     """Lays the estimate over the truth: ``p_truth = scale · R p_estimate + t``.
 
     Attributes:
-        R: (3, 3). t: (3,) m. scale: metres of the truth per metre of the estimate.
+        R: (3, 3), from the estimate's world into the truth's.
+        t: (3,) m, in the truth's world.
+        scale: metres of the truth per metre of the estimate.
     """
 
     R: Array

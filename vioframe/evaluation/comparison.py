@@ -34,7 +34,8 @@ def draw_comparison(
         matched: poses of each estimate with their truth, by name; an estimate whose alignment is not defined
             is left out.
         truth: the whole of it.
-        options: of the association. alignment: of each estimate, by itself.
+        options: of the association.
+        alignment: of each estimate, by itself.
         folder: gets ``top_view.png`` and ``errors.png``.
 
     Returns:

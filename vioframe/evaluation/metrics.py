@@ -40,8 +40,10 @@ class RelativeError:
     """Root mean square error of relative poses.
 
     Attributes:
-        trans_m: metres. trans_percent: percent of the true length of each pair, None where it may be zero.
-        rot_deg: degrees. pairs: how many.
+        trans_m: metres.
+        trans_percent: percent of the true length of each pair; None where that may be zero.
+        rot_deg: degrees.
+        pairs: how many.
     """
 
     trans_m: float
@@ -55,7 +57,10 @@ class SegmentErrors:
     """One entry per segment of the KITTI metric.
 
     Attributes:
-        start: (S,) frame. length_m: (S,). trans: (S,) metres per metre. rot: (S,) rad per metre.
+        start: (S,) number of the first frame.
+        length_m: (S,) nominal length along the truth.
+        trans: (S,) metres per metre.
+        rot: (S,) rad per metre.
     """
 
     start: np.ndarray

@@ -22,7 +22,7 @@ class EvaluationOptions:
         max_gap_s: ``interpolate`` bridges no longer hole of the truth; poses of the truth *at* a stamp always count.
         max_difference_s: ``nearest`` pairs no stamps further apart.
         segment_lengths_m: of t_rel and r_rel, along the truth.
-        segment_step: a segment starts at every so-manieth frame.
+        segment_step: frames from the start of one segment to that of the next.
         rpe_distances_m: of the relative pose error by distance.
         rpe_times_s: of the relative pose error by time.
         plots: draw the figures and the report.

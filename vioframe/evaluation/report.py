@@ -51,7 +51,8 @@ def write_outputs(
     ``plots/<sequence>/``.
 
     Args:
-        runs: the records. rows: of each run, its :func:`~vioframe.evaluation.rows.evaluate_run`.
+        runs: the records.
+        rows: of each run, its :func:`~vioframe.evaluation.rows.evaluate_run`.
         folder: made if missing.
         config_yaml: the resolved configuration, shown in the report.
         options: of the metrics; ``plots=False`` leaves out figures and report.

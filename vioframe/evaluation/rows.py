@@ -219,15 +219,17 @@ def _accuracy(
             [f"rpe_trans_m_{duration:g}s", f"rpe_rot_deg_{duration:g}s"],
             partial(_rpe_by_time, duration_s=duration),
         )
-    add_relative(["t_rel_percent", "r_rel_deg_per_100m"], lambda m: _segments(m, options))
+    by_length: dict[str, dict[str, float | int]] = {}
+
+    def drift(poses: MatchedPoses) -> list[float]:
+        errors = metrics.segment_errors(poses, options.segment_lengths_m, options.segment_step)
+        by_length.update(errors.by_length())
+        return [errors.t_rel_percent, errors.r_rel_deg_per_100m]
+
+    add_relative(["t_rel_percent", "r_rel_deg_per_100m"], drift)
     add(["yaw_rmse_deg"], lambda m: [_rms_deg(metrics.yaw_errors(m))])
     add(["gravity_rmse_deg", "gravity_max_deg"], _gravity)
-    cells.values["segments"] = {}
-    if matched is not None and cells.values["t_rel_percent"] is not None:
-        poses = _scaled(matched) if scaled else matched
-        cells.values["segments"] = metrics.segment_errors(
-            poses, options.segment_lengths_m, options.segment_step
-        ).by_length()
+    cells.values["segments"] = {} if cells.values["t_rel_percent"] is None else by_length
     return cells
 
 
@@ -265,11 +267,6 @@ def _rpe_by_distance(matched: MatchedPoses, distance_m: float) -> list[float]:
 def _rpe_by_time(matched: MatchedPoses, duration_s: float) -> list[float]:
     error = metrics.relative_error_by_time(matched, duration_s)
     return [error.trans_m, error.rot_deg]
-
-
-def _segments(matched: MatchedPoses, options: EvaluationOptions) -> list[float]:
-    errors = metrics.segment_errors(matched, options.segment_lengths_m, options.segment_step)
-    return [errors.t_rel_percent, errors.r_rel_deg_per_100m]
 
 
 def _gravity(matched: MatchedPoses) -> list[float]:

@@ -49,7 +49,8 @@ class SequenceRun:
         windows: pairs of images that were processed.
         wall_s: wall seconds from opening the recording to its end, reading and rendering included.
         counters: what happened that a user should know, such as ``{"dropped frames": 3}``.
-        track_stamps_ns: (K,) and track_counts (K,): number of points followed; empty without a front end.
+        track_stamps_ns: (K,) IMU clock, when points were counted; empty without a front end.
+        track_counts: (K,) number of points followed.
         sample_frames: a few images for the report.
         init: how the fuser was started, ``"rest"`` or ``"groundtruth"``.
         uses_ground_truth: names of the parts that simulate a sensor from the truth.

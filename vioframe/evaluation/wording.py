@@ -13,8 +13,13 @@ class Line:
     """One metric in print.
 
     Attributes:
-        key: in the row. label: in words. short: for a narrow column. unit: printed behind or above the number.
-        factor: from the stored number to the printed one. signed: show a plus. digits: significant ones.
+        key: in the row.
+        label: in words.
+        short: for a narrow column.
+        unit: printed behind or above the number.
+        factor: from the stored number to the printed one.
+        signed: show a plus.
+        digits: significant ones.
     """
 
     key: str
@@ -130,7 +135,7 @@ def join(labels: Iterable[str], limit: int = 4) -> str:
 
 
 def counter_text(row: Mapping[str, object]) -> str:
-    """``3 dropped frames, 1 IMU gaps``, or nothing."""
+    """``dropped frames: 3, imu gaps: 1``, or nothing."""
     counters = row.get("counters")
     if not isinstance(counters, Mapping):
         return ""
