@@ -96,6 +96,7 @@ def test_sweep_of_two_by_two_in_parallel_is_nested_in_one_store(cli, tmp_path):
         "rig=blind",
         "dataset.duration_s=4",
         "init=groundtruth",
+        "evaluation.plots=false",
         "hydra/launcher=joblib",
         "hydra.launcher.n_jobs=2",
         "hydra.sweep.dir=sweep",
