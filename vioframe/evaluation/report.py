@@ -18,6 +18,7 @@ from vioframe.evaluation.wording import (
     UNDEFINED,
     Line,
     accuracy_lines,
+    brief_accuracy_lines,
     counter_text,
     failure_text,
     has_run,
@@ -28,6 +29,7 @@ from vioframe.evaluation.wording import (
     running_lines,
     show,
     significant,
+    total_ms,
 )
 
 log = logging.getLogger(__name__)
@@ -154,12 +156,8 @@ def _failure(row: Row) -> str:
 
 
 def _overview(rows: Sequence[Row]) -> str:
-    keys = (
-        "path_m", "ate_m", "ate_se3_m", "ate_se3_percent", "ate_sim3_m", "scale_error_percent", "t_rel_percent",
-        "r_rel_deg_per_100m", "anees_position", "anees_orientation", "completion", "real_time_factor",
-    )  # fmt: skip
     fullest = max(rows, key=len)
-    lines = [line for line in (*accuracy_lines(fullest), *running_lines(fullest)) if line.key in keys]
+    lines = [*brief_accuracy_lines(fullest), *running_lines(fullest)]
     timed = "ms_per_frame" in fullest
     head = "".join(f"<th>{escape(line.short)}<br><small>{escape(line.unit)}</small></th>" for line in lines)
     head += "<th>time<br><small>ms/frame</small></th>" if timed else ""
@@ -171,7 +169,7 @@ def _overview(rows: Sequence[Row]) -> str:
     for number, row in enumerate(rows):
         name = f"<a href='#s{number}'>{escape(str(row['sequence']))}</a>"
         status = escape(str(row["status"]))
-        milliseconds = f"<td>{_total_ms(row)}</td>" if timed else ""
+        milliseconds = f"<td>{_total_ms_cell(row)}</td>" if timed else ""
         table.append(
             f"<tr><td class=name>{name}</td>{_cells(row, lines)}{milliseconds}<td class={status}>{status}</td></tr>"
         )
@@ -197,11 +195,9 @@ def _value(row: Mapping[str, object], line: Line) -> str:
     return f"<span class=undefined title='{escape(reason, quote=True)}'>{UNDEFINED}</span>"
 
 
-def _total_ms(row: Row) -> str:
-    parts = row.get("ms_per_frame")
-    if isinstance(parts, Mapping):
-        return significant(float(parts["total"]))
-    return f"<span class=undefined>{UNDEFINED}</span>"
+def _total_ms_cell(row: Row) -> str:
+    text = total_ms(row)
+    return text if text != UNDEFINED else f"<span class=undefined>{UNDEFINED}</span>"
 
 
 def _sequence_section(row: Row, figures: Mapping[str, Path], *, anchor: str, heading: bool) -> str:

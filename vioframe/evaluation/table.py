@@ -8,6 +8,7 @@ from vioframe.evaluation.rows import Row
 from vioframe.evaluation.wording import (
     UNDEFINED,
     accuracy_lines,
+    brief_accuracy_lines,
     counter_text,
     failure_text,
     has_run,
@@ -18,6 +19,7 @@ from vioframe.evaluation.wording import (
     running_lines,
     show,
     significant,
+    total_ms,
 )
 
 if TYPE_CHECKING:
@@ -27,16 +29,6 @@ if TYPE_CHECKING:
 
 # Spaces and rule between two columns.
 _GUTTER = 3
-_WIDE_KEYS = (
-    "path_m",
-    "ate_m",
-    "ate_se3_m",
-    "ate_se3_percent",
-    "ate_sim3_m",
-    "scale_error_percent",
-    "t_rel_percent",
-    "r_rel_deg_per_100m",
-)
 
 
 def print_rows(rows: Sequence[Row], folder: Path, *, hints: Mapping[str, str] | None = None) -> None:
@@ -141,20 +133,15 @@ def _columns(rows: Sequence[Row], outputs: Sequence[tuple[str, Row, Mapping[str,
     """Heading and cells of every column; what a final trajectory cannot have stays empty."""
     fullest = max(rows, key=len)
     columns = [["\nstatus", *(str(row["status"]) if output is row else "" for _, row, output in outputs)]]
-    accuracy = [line for line in accuracy_lines(fullest) if line.key in _WIDE_KEYS]
+    accuracy = brief_accuracy_lines(fullest)
     # How much of the recording the other numbers speak of comes first.
     running = sorted(running_lines(fullest), key=lambda line: line.key != "completion")
     for line in (*running[:1], *accuracy, *running[1:]):
         cells = [show(output, line, unit=False) if line.key in output else "" for _, _, output in outputs]
         columns.append([f"{line.short}\n{line.unit}", *cells])
     if "ms_per_frame" in fullest:
-        columns.append(["time\nms/frame", *(_total_ms(row) if output is row else "" for _, row, output in outputs)])
+        columns.append(["time\nms/frame", *(total_ms(row) if output is row else "" for _, row, output in outputs)])
     return columns
-
-
-def _total_ms(row: Row) -> str:
-    parts = row.get("ms_per_frame")
-    return significant(float(parts["total"])) if isinstance(parts, Mapping) else UNDEFINED
 
 
 def _table_of(names: Sequence[str], columns: Sequence[Sequence[str]]) -> "Table":

@@ -57,6 +57,16 @@ _RUNNING = (
     Line(key="completion", label="completion", short="complete", unit="%", factor=100.0, digits=4),
     Line(key="real_time_factor", label="real-time factor", short="real time", unit="×"),
 )
+_BRIEF = (
+    "path_m",
+    "ate_m",
+    "ate_se3_m",
+    "ate_se3_percent",
+    "ate_sim3_m",
+    "scale_error_percent",
+    "t_rel_percent",
+    "r_rel_deg_per_100m",
+)
 _RPE_PATTERN = re.compile(r"rpe_(?P<what>trans_percent|rot_deg|trans_m)_(?P<length>[0-9.e+-]+)(?P<unit>m|s)$")
 
 
@@ -64,6 +74,11 @@ def accuracy_lines(row: Mapping[str, object]) -> list[Line]:
     """The metrics that compare with the truth, in the order of print; RPE as the options asked for it."""
     rpe = (line for key in row if (line := _rpe_line(key)) is not None)
     return [line for line in (*_FIXED, *rpe, *_DRIFT) if line.key in row]
+
+
+def brief_accuracy_lines(row: Mapping[str, object]) -> list[Line]:
+    """Those of :func:`accuracy_lines` that are shown where several sequences have a row each."""
+    return [line for line in accuracy_lines(row) if line.key in _BRIEF]
 
 
 def running_lines(row: Mapping[str, object]) -> list[Line]:
@@ -111,6 +126,12 @@ def significant(value: float, digits: int = 3) -> str:
     # 9.9996 rounds up into the next decade; asking again keeps the digits right.
     decimals = max(digits - 1 - exponent, 0)
     return f"{value:.{min(decimals, 6)}f}"
+
+
+def total_ms(row: Mapping[str, object]) -> str:
+    """Wall milliseconds a window in print, or ``undefined``."""
+    parts = row.get("ms_per_frame")
+    return significant(float(parts["total"])) if isinstance(parts, Mapping) else UNDEFINED
 
 
 def reasons(row: Mapping[str, object]) -> dict[str, list[str]]:
