@@ -377,9 +377,7 @@ class Renderer:
         first, second, third = directions
         normal = np.where(axis == 0, first, np.where(axis == 1, second, third))
         with np.errstate(divide="ignore", invalid="ignore"):
-            plane = tables.plane.take(numbers) - np.where(
-                axis == 0, moved[0], np.where(axis == 1, moved[1], moved[2])
-            )
+            plane = tables.plane.take(numbers) - np.where(axis == 0, moved[0], np.where(axis == 1, moved[1], moved[2]))
             hit = plane / normal
             u = np.where(axis == 0, second * hit + moved[1], first * hit + moved[0])
             v = np.where(axis == 2, second * hit + moved[1], third * hit + moved[2])
