@@ -64,6 +64,8 @@ def main() -> None:
     # Matrices are small here: BLAS threads would only wait for each other, beside the thread that reads images.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
+    # A corrupt image is reported once, by the reader that meets it, with its path.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     try:
         extend_hydra()
     except VioframeError as error:

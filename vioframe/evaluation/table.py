@@ -44,9 +44,22 @@ def print_rows(rows: Sequence[Row], folder: Path, *, hints: Mapping[str, str] | 
     console = Console()
     for part in render_rows(rows, console.width):
         console.print(part)
-    console.print(f"results in {folder}", style="bold", soft_wrap=True, highlight=False, markup=False)
     report = folder / "report.html"
-    for label, text in {"report": str(report) if report.exists() else "", **(hints or {})}.items():
+    print_places(folder, {"report": str(report) if report.exists() else "", **(hints or {})})
+
+
+def print_places(folder: Path, hints: Mapping[str, str]) -> None:
+    """Print where the results are.
+
+    Args:
+        folder: the output folder.
+        hints: what else there is to see, by the one word that introduces it; empty ones are left out.
+    """
+    from rich.console import Console
+
+    console = Console()
+    console.print(f"results in {folder}", style="bold", soft_wrap=True, highlight=False, markup=False)
+    for label, text in hints.items():
         if text:
             # As wide as "results in".
             console.print(f"{label:<10} {text}", soft_wrap=True, highlight=False, markup=False)

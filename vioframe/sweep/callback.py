@@ -129,6 +129,7 @@ def conclude(*, interrupted: bool = False) -> list[JobResult]:
         return []
     if _sweep.failed is not None:
         return _sweep.failed
+    from vioframe.evaluation.table import print_places
     from vioframe.sweep.files import write_files
     from vioframe.sweep.summary import summarise
     from vioframe.sweep.table import markdown_table, print_table
@@ -144,6 +145,7 @@ def conclude(*, interrupted: bool = False) -> list[JobResult]:
         if any(job.folder for job in jobs):
             summary = summarise(jobs)
             print_table(summary)
+            print_places(_sweep.folder, {"compare": tracker.hint})
             for path in write_files(summary, _sweep.folder):
                 tracker.log_file(path)
             tracker.log_metrics(summary.metrics())
