@@ -18,12 +18,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vioframe.checks import Array
-from vioframe.conventions import NANOSECONDS, gravity_vector
+from vioframe.conventions import gravity_vector
 from vioframe.errors import StateError
 from vioframe.geometry import se3, so3
 from vioframe.inertial import bias_walk_covariance
-from vioframe.initialisation import StillnessDetector
-from vioframe.types import ImuBias, ImuNoise, InertialDelta, NavState, Status, SyncedWindow
+from vioframe.types import ImuBias, ImuNoise, InertialDelta, NavState, Status
 
 THETA, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 BIAS_GYRO, BIAS_ACCEL = slice(9, 12), slice(12, 15)
@@ -159,196 +158,6 @@ def symmetrised(covariance: Array) -> Array:
     """The symmetric part, so that rounding cannot accumulate."""
     out: Array = 0.5 * (covariance + covariance.T)
     return out
-
-
-def chi_square_limit(probability: float, degrees: int) -> float:
-    """Value that a χ² variable with this many degrees of freedom stays below with this probability."""
-    from scipy.special import chdtri
-
-    return float(chdtri(degrees, 1.0 - probability))
-
-
-def part_of(delta: InertialDelta, start_s: float, end_s: float) -> InertialDelta:
-    """The increment over [start, end] seconds of a window.
-
-    The motion comes from ``delta.path``, linear between samples; without a path the rate and the specific
-    force are taken as constant. Covariance and bias Jacobian are those of constant noise and slow rotation:
-    they grow with the powers of time of a short interval (θ, v: √T and T; p: T√T and T²).
-    """
-    T = delta.duration_s
-    if start_s <= 0.0 and end_s >= T:
-        return delta
-    (R0, v0, p0), (R1, v1, p1) = _point_of(delta, start_s), _point_of(delta, end_s)
-    step = end_s - start_s
-    share = step / T
-    growth = np.repeat([np.sqrt(share), np.sqrt(share), share * np.sqrt(share)], 3)
-    bias_jacobian = delta.bias_jacobian.copy()
-    bias_jacobian[0:3] *= share
-    bias_jacobian[3:6, 0:3] *= share**2
-    bias_jacobian[3:6, 3:6] *= share
-    bias_jacobian[6:9, 0:3] *= share**3
-    bias_jacobian[6:9, 3:6] *= share**2
-    # Jacobians of v and p are in the frame at the window's start; turn them into that of the part.
-    bias_jacobian[3:6] = R0.T @ bias_jacobian[3:6]
-    bias_jacobian[6:9] = R0.T @ bias_jacobian[6:9]
-    return replace(
-        delta,
-        delta_R=R0.T @ R1,
-        delta_v=R0.T @ (v1 - v0),
-        delta_p=R0.T @ (p1 - p0 - v0 * step),
-        path=None,
-        duration_s=step,
-        covariance=growth[:, None] * delta.covariance * growth,
-        bias_jacobian=bias_jacobian,
-        reintegrate=None,
-    )
-
-
-def _point_of(delta: InertialDelta, at_s: float) -> tuple[Array, Array, Array]:
-    """Increment (R, v, p) from the start of the window to ``at_s`` seconds after it."""
-    path = delta.path
-    if path is None:
-        share = at_s / delta.duration_s
-        force = delta.delta_v / delta.duration_s
-        rest = delta.delta_p - 0.5 * force * delta.duration_s**2
-        turn = so3.exp(share * so3.log(delta.delta_R))
-        return turn, force * at_s, 0.5 * force * at_s**2 + rest * share**2
-    elapsed = (path.stamps_ns - path.stamps_ns[0]) / NANOSECONDS
-    after = int(np.clip(np.searchsorted(elapsed, at_s), 1, len(elapsed) - 1))
-    before = after - 1
-    span = elapsed[after] - elapsed[before]
-    into = at_s - elapsed[before]
-    share = into / span
-    turn = path.delta_R[before] @ so3.exp(share * so3.log(path.delta_R[before].T @ path.delta_R[after]))
-    force = (path.delta_v[after] - path.delta_v[before]) / span
-    v = path.delta_v[before] + force * into
-    rest = path.delta_p[after] - path.delta_p[before] - path.delta_v[before] * span - 0.5 * force * span**2
-    p = path.delta_p[before] + path.delta_v[before] * into + 0.5 * force * into**2 + rest * share**2
-    return turn, v, p
-
-
-def add_gap(delta: InertialDelta, gap_s: float, rate_sigma: float, accel_sigma: float) -> InertialDelta:
-    """Widen the increment's covariance for a hole in the samples.
-
-    Inside the hole the rate and the specific force are off by an unknown constant of these sigmas.
-
-    Args:
-        delta: over the window with the hole.
-        gap_s: length of the hole.
-        rate_sigma: rad/s.
-        accel_sigma: m/s².
-    """
-    gap = min(gap_s, delta.duration_s)
-    covariance = delta.covariance.copy()
-    covariance[0:3, 0:3] += (rate_sigma * gap) ** 2 * np.eye(3)
-    # The hole's place in the window is not known: the velocity error acts for half the window on average.
-    velocity, position = accel_sigma * gap, 0.5 * accel_sigma * gap * delta.duration_s
-    for a, sigma_a in ((3, velocity), (6, position)):
-        for b, sigma_b in ((3, velocity), (6, position)):
-            covariance[a : a + 3, b : b + 3] += sigma_a * sigma_b * np.eye(3)
-    covariance[6:9, 6:9] += position**2 / 3.0 * np.eye(3)
-    # Integrating again would lose what was added.
-    return replace(delta, covariance=covariance, reintegrate=None)
-
-
-def coasting(body: Body, duration_s: float, gravity: Array, rate_sigma: float, accel_sigma: float) -> InertialDelta:
-    """The increment of a stretch without any sample: constant velocity and attitude, and little trust in it.
-
-    Args:
-        body: at the start of the stretch.
-        duration_s: of the stretch.
-        gravity: (3,) m/s², in the world.
-        rate_sigma: rad/s, of an unknown constant rate.
-        accel_sigma: m/s², of an unknown constant acceleration.
-    """
-    lift = -body.R.T @ gravity
-    blank = InertialDelta(
-        delta_R=np.eye(3),
-        delta_v=lift * duration_s,
-        delta_p=0.5 * lift * duration_s**2,
-        duration_s=duration_s,
-        covariance=np.zeros((9, 9)),
-        bias=body.bias,
-        bias_jacobian=np.zeros((9, 6)),
-    )
-    return add_gap(blank, duration_s, rate_sigma, accel_sigma)
-
-
-class StandstillTest:
-    """Says whether the body is at rest, so that a filter may measure its motion as none.
-
-    A body that coasts smoothly looks the same to its inertial sensors, so the filter must also find its own
-    speed near zero; the measurement then still has to pass the filter's χ² gate.
-
-    Args:
-        detector: on the inertial samples.
-        gyro_limit: rad/s; a mean rate that differs more from the estimated bias is a turn.
-        speed_limit: m/s; a larger estimated speed is motion.
-    """
-
-    def __init__(self, detector: StillnessDetector, *, gyro_limit: float, speed_limit: float) -> None:
-        self._detector = detector
-        self._gyro_limit = gyro_limit
-        self._speed_limit = speed_limit
-
-    def push(self, window: SyncedWindow, body: Body) -> bool:
-        """Take one more window, and what the filter believes at its start."""
-        stillness = self._detector.push(window)
-        if stillness is None or self._detector.motion(stillness) is not None:
-            return False
-        return bool(
-            np.linalg.norm(stillness.gyro_mean - body.bias.gyro) < self._gyro_limit
-            and np.linalg.norm(body.v) < self._speed_limit
-        )
-
-
-class NoiseAdaptation:
-    """Raises the stated noise of both sensors while they contradict each other more than it allows.
-
-    Data sheets state the noise of a sensor that does not shake; on a vehicle it is larger, by a factor that
-    depends on the vehicle. Odometry states the noise of its points, and its steps share the error of the map.
-    A filter that believes both refuses good measurements. Here the logarithm of a variance factor follows the
-    innovations (after Mehra, "Approaches to adaptive filtering", IEEE TAC 1972): with χ² that of a block of
-    three, over τ seconds it moves by ``min(χ²/3, 9) − 1.6``, never below zero. Where the noise is as stated,
-    χ²/3 has a mean of 1, and the factor stays at 1.
-
-    Rotation is where cameras are good, so what contradicts there is the inertial sensor, and what shakes its
-    gyro shakes its accelerometer. Translation over one step is where the inertial sensor is good.
-
-    Args:
-        time_s: τ.
-        most: largest factor on a standard deviation; 1 adapts nothing.
-    """
-
-    _TARGET = 1.6
-    _CAP = 9.0
-
-    def __init__(self, time_s: float, most: float) -> None:
-        self._time_s = time_s
-        self._most = 2.0 * float(np.log(most))
-        self._logs = np.zeros(2)
-
-    @property
-    def inertial(self) -> float:
-        """Factor on the standard deviations of the inertial increments."""
-        return float(np.exp(0.5 * self._logs[0]))
-
-    @property
-    def translation(self) -> float:
-        """Factor on the standard deviations of the odometry's translation."""
-        return float(np.exp(0.5 * self._logs[1]))
-
-    def learn(self, residual: Array, S: Array, duration_s: float) -> None:
-        """Take the innovation (6,), ordered (rotation, translation), of one window, and its covariance (6, 6)."""
-        squares = np.array(
-            [residual[part] @ np.linalg.solve(S[part, part], residual[part]) for part in (slice(0, 3), slice(3, 6))]
-        )
-        step = np.minimum(squares / 3.0, self._CAP) - self._TARGET
-        self._logs = np.clip(self._logs + duration_s / self._time_s * step, 0.0, self._most)
-
-    def believe_translation(self) -> None:
-        """Take the odometry's translation at its word again."""
-        self._logs[1] = 0.0
 
 
 class InertialFilter:
@@ -490,5 +299,3 @@ class InertialFilter:
     def normalise(self) -> None:
         """Take rounding off the rotation."""
         self.body = replace(self.body, R=so3.normalise(self.body.R))
-
-

@@ -11,16 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vioframe.checks import Array
+from vioframe.consistency import NoiseAdaptation, StandstillTest, chi_square_limit
 from vioframe.conventions import NANOSECONDS, seconds
-from vioframe.error_state import (
-    InertialFilter,
-    NoiseAdaptation,
-    StandstillTest,
-    add_gap,
-    chi_square_limit,
-    coasting,
-)
+from vioframe.error_state import InertialFilter
 from vioframe.errors import ConfigError, StateError
+from vioframe.increments import add_gap, coasting
 from vioframe.initialisation import RestInitialiser, StillnessDetector, initial_covariance
 from vioframe.interfaces import Fuser
 from vioframe.types import (

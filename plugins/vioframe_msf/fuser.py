@@ -6,8 +6,9 @@ from typing import ClassVar
 import numpy as np
 
 from vioframe.checks import Array
-from vioframe.error_state import INERTIAL, VELOCITY, part_of
+from vioframe.error_state import INERTIAL, VELOCITY
 from vioframe.errors import ConfigError
+from vioframe.increments import part_of
 from vioframe.interfaces import CONSISTENT_SCALE, INERTIAL_DELTA, RELATIVE_POSE
 from vioframe.loose_fusion import (
     InertialOptions,

@@ -3,20 +3,16 @@
 import numpy as np
 import pytest
 
+from vioframe.consistency import StandstillTest, chi_square_limit
 from vioframe.conventions import gravity_vector
 from vioframe.data.simulator import CameraSettings, SimulatedDataset
 from vioframe.error_state import (
     BIAS,
     Body,
     InertialFilter,
-    StandstillTest,
-    add_gap,
-    chi_square_limit,
-    coasting,
     difference,
     invariant_from_local,
     local_from_invariant,
-    part_of,
     process_noise,
     propagate,
     retract,
@@ -24,6 +20,7 @@ from vioframe.error_state import (
 )
 from vioframe.errors import StateError
 from vioframe.geometry import se3, so3
+from vioframe.increments import add_gap, coasting, part_of
 from vioframe.initialisation import StillnessDetector, initial_covariance
 from vioframe.types import Camera, Frame, ImuBias, ImuBlock, ImuNoise, InertialDelta, NavState, SensorRig, SyncedWindow
 
