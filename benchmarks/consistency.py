@@ -79,8 +79,13 @@ def run_once(name: str, seed: int, family: str, seconds_long: float, fuser: Fuse
     def perturbed(stamp_ns: int) -> NavState:
         T, v, bias = true_state(stamp_ns)
         covariance = initial_covariance(
-            T[:3, :3], tilt_sigma=0.01, yaw_sigma=0.005, position_sigma=0.01, velocity_sigma=0.02,
-            gyro_bias_sigma=0.005, accel_bias_sigma=0.05,
+            T[:3, :3],
+            tilt_sigma=0.01,
+            yaw_sigma=0.005,
+            position_sigma=0.01,
+            velocity_sigma=0.02,
+            gyro_bias_sigma=0.005,
+            accel_bias_sigma=0.05,
         )
         error = rng.multivariate_normal(np.zeros(15), covariance)
         T = se3.from_parts(T[:3, :3] @ so3.exp(error[:3]).T, T[:3, 3] - error[3:6])
@@ -95,13 +100,15 @@ def run_once(name: str, seed: int, family: str, seconds_long: float, fuser: Fuse
     squares = {block: [] for block in BLOCKS}
     for state in states[1:]:
         T, v, bias = true_state(state.stamp_ns)
-        error = np.concatenate([
-            so3.log(state.T_world_body[:3, :3].T @ T[:3, :3]),
-            T[:3, 3] - state.T_world_body[:3, 3],
-            v - state.v_world_body,
-            bias[:3] - state.bias.gyro,
-            bias[3:] - state.bias.accel,
-        ])
+        error = np.concatenate(
+            [
+                so3.log(state.T_world_body[:3, :3].T @ T[:3, :3]),
+                T[:3, 3] - state.T_world_body[:3, 3],
+                v - state.v_world_body,
+                bias[:3] - state.bias.gyro,
+                bias[3:] - state.bias.accel,
+            ]
+        )
         for block, part in BLOCKS.items():
             square = error[part] @ np.linalg.solve(state.covariance[part, part], error[part])
             squares[block].append(square / len(error[part]))
@@ -126,10 +133,12 @@ def main() -> None:
     for name in arguments.fusers.split(","):
         started = time.process_time()
         runs = [run_once(name, seed, arguments.family, arguments.seconds) for seed in range(arguments.runs)]
-        print(f"fuser={name}: {len(runs)} runs of {arguments.seconds:g} s ({arguments.family}), "
-              f"{time.process_time() - started:.0f} s CPU, {np.mean([r.update_ms for r in runs]):.2f} ms an update, "
-              f"end error {np.mean([r.position_error_m for r in runs]):.3f} m "
-              f"on {np.mean([r.path_m for r in runs]):.1f} m")
+        print(
+            f"fuser={name}: {len(runs)} runs of {arguments.seconds:g} s ({arguments.family}), "
+            f"{time.process_time() - started:.0f} s CPU, {np.mean([r.update_ms for r in runs]):.2f} ms an update, "
+            f"end error {np.mean([r.position_error_m for r in runs]):.3f} m "
+            f"on {np.mean([r.path_m for r in runs]):.1f} m"
+        )
         for block in BLOCKS:
             values = np.array([run.nees[block] for run in runs])
             spread = values.std(ddof=1) / np.sqrt(len(values))

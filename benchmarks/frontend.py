@@ -73,9 +73,7 @@ def main() -> None:
         data = ReplayDataset(source=source, cameras=cameras, start_s=options.start, duration_s=options.seconds)
     else:
         camera = CameraSettings(count=cameras)
-        data = SimulatedDataset(
-            sequence=options.family, seed=options.seed, duration_s=options.seconds, camera=camera
-        )
+        data = SimulatedDataset(sequence=options.family, seed=options.seed, duration_s=options.seconds, camera=camera)
     recording = data.open(data.sequences[0])
     trajectory = recording.ground_truth()
     estimator, frontend = ESTIMATORS[options.vo](), KltFrontend()

@@ -230,9 +230,7 @@ def _refine(
             weighted = jacobian * cauchy_weights(error * error, _ROBUST)[:, None]
             normal = weighted.T @ jacobian
             gradient = weighted.T @ error
-            best = TwoViewFit(
-                R_prev_cur=R, t=t, covariance=normal, tangents=tangents, errors=np.abs(error), cost=cost
-            )
+            best = TwoViewFit(R_prev_cur=R, t=t, covariance=normal, tangents=tangents, errors=np.abs(error), cost=cost)
             damping *= 0.1
             if gain < 1e-7:
                 break

@@ -92,9 +92,7 @@ class LocalMapVO(VOEstimator):
         self._window_size = window
         self._drift = drift_px
         self._covariance_scale = covariance_scale
-        self._window = KeyframeWindow(
-            size=window, fixed=fixed, parallax_px=keyframe_parallax_px, share=keyframe_share
-        )
+        self._window = KeyframeWindow(size=window, fixed=fixed, parallax_px=keyframe_parallax_px, share=keyframe_share)
         self._camera: Camera | None = None
 
     def setup(self, rig: SensorRig) -> None:

@@ -354,9 +354,7 @@ class StereoMatcher:
 
     def _images(self, frame: Frame) -> tuple[Image, Image]:
         if len(frame.images) < 2:
-            raise DataError(
-                f"frame at {frame.stamp_ns} ns has {len(frame.images)} image(s), and vo=stereo needs two"
-            )
+            raise DataError(f"frame at {frame.stamp_ns} ns has {len(frame.images)} image(s), and vo=stereo needs two")
         gray = []
         for index, camera in enumerate((self.left, self.right)):
             image = frame.images[index]

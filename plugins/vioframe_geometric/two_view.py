@@ -52,7 +52,9 @@ class TwoViewVO(VOEstimator):
         max_direction_deg: float = 20.0,
     ) -> None:
         require_positive(
-            sigma_px=sigma_px, threshold_px=threshold_px, min_parallax_px=min_parallax_px,
+            sigma_px=sigma_px,
+            threshold_px=threshold_px,
+            min_parallax_px=min_parallax_px,
             max_direction_deg=max_direction_deg,
         )
         if min_points < 8:
