@@ -223,6 +223,7 @@ class StartOptions:
         rest_duration_s: length of the standstill that the filter starts from by itself.
         rest_gyro: rad/s, scatter of the rate that counts as rest.
         rest_accel: m/s², scatter of the specific force that counts as rest.
+        rest_flow_deg: degrees, median angle by which image points may move during it.
         rest_accel_bias_sigma: m/s² an axis, of the accelerometer bias at that standstill.
         tilt_sigma: rad, of a given state that states no covariance; so the rest.
         yaw_sigma: rad.
@@ -235,6 +236,7 @@ class StartOptions:
     rest_duration_s: float = 0.75
     rest_gyro: float = 0.02
     rest_accel: float = 0.15
+    rest_flow_deg: float = 0.25
     rest_accel_bias_sigma: float = 0.1
     tilt_sigma: float = 2e-3
     yaw_sigma: float = 1e-3
@@ -262,6 +264,7 @@ class StartOptions:
             gyro_threshold=self.rest_gyro,
             accel_threshold=self.rest_accel,
             accel_bias_sigma=self.rest_accel_bias_sigma,
+            max_flow_deg=self.rest_flow_deg,
         )
 
     def covariance_of(self, state: NavState) -> Array:
@@ -380,7 +383,7 @@ class LooseFuser(Fuser):
         states = []
         if not self._begun:
             if self._given is None:
-                state = self._rest.push(window)
+                state = self._rest.push(window, measurement.features)
                 if state is not None:
                     states.append(self._begin(state, self._start.covariance_of(state), window.current.stamp_ns))
                 return states

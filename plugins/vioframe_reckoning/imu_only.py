@@ -104,7 +104,7 @@ class ImuOnlyFuser(Fuser):
         states = []
         if self._stamp_ns is None:
             if self._given is None:
-                state = self._rest.push(window)
+                state = self._rest.push(window, measurement.features)
                 if state is not None:
                     states.append(self._begin(self._filter, state, window.current.stamp_ns))
                 return states
