@@ -207,6 +207,10 @@ class StandstillOptions:
         _check_not_negative("standstill", speed=self.speed)
         _check_gate("standstill", self.gate_probability)
 
+    def gate(self) -> float:
+        """Largest χ² of a standstill measurement that is used."""
+        return _gate(self.gate_probability, 9)
+
     def test(self, rig: SensorRig) -> StandstillTest:
         """The test with these limits for a sequence."""
         detector = StillnessDetector(
@@ -329,7 +333,7 @@ class LooseFuser(Fuser):
         self._inertial = inertial or InertialOptions()
         self._standstill = standstill or StandstillOptions()
         self._start = start or StartOptions()
-        self._standstill_gate = _gate(self._standstill.gate_probability, 9)
+        self._standstill_gate = self._standstill.gate()
         self._gap_allowed_ns = round(self._inertial.gap_allowed_s * NANOSECONDS)
         self._ready = False
 

@@ -68,6 +68,7 @@ class ImuOnlyFuser(Fuser):
         self._gap_sigmas = (gap_rate_sigma, gap_accel_sigma)
         self._gap_allowed_ns = round(gap_allowed_s * NANOSECONDS)
         self._standstill = standstill or StandstillOptions(enabled=False)
+        self._standstill_gate = self._standstill.gate()
         self._start = start or StartOptions()
         self._filter: InertialFilter | None = None
 
@@ -141,10 +142,12 @@ class ImuOnlyFuser(Fuser):
         filter_.clone_pose()
         filter_.propagate(delta)
         standstill = self._standstill
-        filter_.correct(
-            *filter_.standstill_measurement(
-                standstill.rotation_sigma, standstill.position_sigma, standstill.velocity_sigma
-            )
+        H, residual, noise = filter_.standstill_measurement(
+            standstill.rotation_sigma, standstill.position_sigma, standstill.velocity_sigma
         )
+        if filter_.innovation(H, residual, noise)[1] <= self._standstill_gate:
+            filter_.correct(H, residual, noise)
+            self._counts["zero-velocity updates"] += 1
+        else:
+            self._counts["gated standstills"] += 1
         filter_.drop_clone()
-        self._counts["zero-velocity updates"] += 1
