@@ -86,8 +86,8 @@ class Strapdown(InertialIntegrator):
         by_bias = np.zeros((count - 1, 9, 6))
         by_bias[:, :3, :3] = so3.right_jacobian(phi) @ phi_by_gyro
         by_bias[:, 3:6, :3] = speed_by_phi @ phi_by_gyro - s33 * s33 / 12 * so3.hat(a0 - a1)
-        by_bias[:, 3:6, 3:] = (
-            -s33 * (identity + phi_hat / 2 + phi_hat @ phi_hat / 6) - s33 * s33 / 12 * so3.hat(w0 - w1)
+        by_bias[:, 3:6, 3:] = -s33 * (identity + phi_hat / 2 + phi_hat @ phi_hat / 6) - s33 * s33 / 12 * so3.hat(
+            w0 - w1
         )
         by_bias[:, 6:, :3] = -s33 / 6 * push_hat @ phi_by_gyro
         by_bias[:, 6:, 3:] = -s33 * s33 * (identity / 2 + phi_hat / 6)

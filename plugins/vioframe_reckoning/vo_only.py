@@ -191,9 +191,7 @@ class VoOnlyFuser(Fuser):
     def _state(self, stamp_ns: int, status: Status) -> NavState:
         covariance = None
         if self._covariance is not None:
-            covariance = np.diag(
-                np.repeat([0.0, 0.0, 0.0, _UNKNOWN_GYRO_BIAS**2, _UNKNOWN_ACCEL_BIAS**2], 3)
-            )
+            covariance = np.diag(np.repeat([0.0, 0.0, 0.0, _UNKNOWN_GYRO_BIAS**2, _UNKNOWN_ACCEL_BIAS**2], 3))
             into_state = _local_from_state(self._T_world_body).T
             pose = into_state @ self._covariance @ into_state.T
             covariance[:6, :6] = 0.5 * (pose + pose.T)

@@ -189,9 +189,7 @@ class BufferedSynchronizer(Synchronizer):
         around = stamps_ns[first : last + 1]
         imu = self._cut(samples, previous.stamp_ns, current.stamp_ns)
         self._emitted = True
-        return SyncedWindow(
-            previous=previous, current=current, imu=imu, gap_ns=int((around[1:] - around[:-1]).max())
-        )
+        return SyncedWindow(previous=previous, current=current, imu=imu, gap_ns=int((around[1:] - around[:-1]).max()))
 
     def _joined(self) -> ImuBlock:
         if len(self._blocks) > 1:
