@@ -13,6 +13,7 @@ from rich.console import Console
 from synthetic_runs import make_run
 from vioframe.evaluation import EvaluationOptions, SequenceRun
 from vioframe.evaluation.plots import draw_run
+from vioframe.evaluation.plots.motion import nearest_turn_deg
 from vioframe.evaluation.report import folder_names, write_outputs
 from vioframe.evaluation.rows import evaluate_run
 from vioframe.evaluation.table import print_rows, render_rows
@@ -186,3 +187,9 @@ def test_tables_of_several_sequences_lose_nothing_to_the_width(width: int) -> No
 )
 def test_significant_digits(value: float, text: str) -> None:
     assert significant(value) == text
+
+
+def test_angles_are_drawn_in_the_turn_of_the_truth() -> None:
+    angles = np.array([[187.0, -68.0, -350.0], [190.0, -67.0, -352.0]])
+    moved = nearest_turn_deg(angles, np.array([-171.0, -67.5, 9.0]))
+    np.testing.assert_allclose(moved, [[-173.0, -68.0, 10.0], [-170.0, -67.0, 8.0]])

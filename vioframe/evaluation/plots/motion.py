@@ -92,10 +92,9 @@ def draw_pose(drawing: Drawing) -> "Figure | None":
         time_s, position = with_breaks(drawing.time_s(stamps_ns), poses[:, :3, 3])
         angles = _roll_pitch_yaw_deg(poses[:, :3, :3])
         if reference is not None:
-            # Unwrapping starts anywhere: bring the curve to within half a turn of the truth where it begins.
             known_s, known = reference
-            at_start = np.interp(drawing.time_s(stamps_ns)[0], known_s, known[:, 2])
-            angles[:, 2] -= 360.0 * np.round((angles[0, 2] - at_start) / 360.0)
+            start_s = drawing.time_s(stamps_ns)[0]
+            angles = nearest_turn_deg(angles, np.array([np.interp(start_s, known_s, column) for column in known.T]))
         else:
             reference = (drawing.time_s(stamps_ns), angles)
         _, angles = with_breaks(drawing.time_s(stamps_ns), angles)
@@ -124,6 +123,15 @@ def _widen(axes: "Axes", smallest: float) -> None:
     if high - low < smallest:
         centre = 0.5 * (low + high)
         axes.set_ylim(centre - 0.5 * smallest, centre + 0.5 * smallest)
+
+
+def nearest_turn_deg(angles: Array, at_start: Array) -> Array:
+    """Angles (N, 3) moved by whole turns so that the first is within half a turn of ``at_start`` (3,), all in °.
+
+    Unwrapping starts anywhere: a body near ±180° would else be drawn a turn away from the truth.
+    """
+    moved: Array = angles - 360.0 * np.round((angles[0] - at_start) / 360.0)
+    return moved
 
 
 def _roll_pitch_yaw_deg(R: Array) -> Array:
