@@ -7,17 +7,10 @@ import numpy as np
 from vioframe.checks import Array
 from vioframe.error_state import POSE, InertialFilter
 from vioframe.errors import StateError
+from vioframe.fusion_options import InertialOptions, StandstillOptions, StartOptions, VisualOptions
 from vioframe.geometry import se3
 from vioframe.interfaces import INERTIAL_DELTA, METRIC_SCALE, RELATIVE_POSE
-from vioframe.loose_fusion import (
-    InertialOptions,
-    LooseFuser,
-    StandstillOptions,
-    StartOptions,
-    Step,
-    VisualMotion,
-    VisualOptions,
-)
+from vioframe.loose_fusion import LooseFuser, Step, VisualMotion
 
 
 def relative_pose_measurement(

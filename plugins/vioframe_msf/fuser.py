@@ -8,17 +8,10 @@ import numpy as np
 from vioframe.checks import Array
 from vioframe.error_state import INERTIAL, VELOCITY
 from vioframe.errors import ConfigError
+from vioframe.fusion_options import InertialOptions, StandstillOptions, StartOptions, VisualOptions
 from vioframe.increments import part_of
 from vioframe.interfaces import CONSISTENT_SCALE, INERTIAL_DELTA, RELATIVE_POSE
-from vioframe.loose_fusion import (
-    InertialOptions,
-    LooseFuser,
-    StandstillOptions,
-    StartOptions,
-    Step,
-    VisualMotion,
-    VisualOptions,
-)
+from vioframe.loose_fusion import LooseFuser, Step, VisualMotion
 from vioframe.types import InertialDelta, NavState
 from vioframe_msf.search import ScaleSearch
 from vioframe_msf.state import ScaledFilter

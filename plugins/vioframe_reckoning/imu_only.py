@@ -10,9 +10,9 @@ import numpy as np
 from vioframe.conventions import NANOSECONDS, seconds
 from vioframe.error_state import InertialFilter
 from vioframe.errors import ConfigError, StateError
+from vioframe.fusion_options import StandstillOptions, StartOptions
 from vioframe.increments import add_gap, coasting
 from vioframe.interfaces import INERTIAL_DELTA, Fuser
-from vioframe.loose_fusion import StandstillOptions, StartOptions
 from vioframe.types import ImuBias, InertialDelta, Measurement, NavState, SensorRig
 
 

@@ -8,10 +8,10 @@ import pytest
 from inertial_truth import NOISE, make_rig, windows_of
 from shared_data import shared_data
 from vioframe.errors import ConfigError
+from vioframe.fusion_options import StartOptions
 from vioframe.geometry import so3
 from vioframe.image_motion import ImageMotion
 from vioframe.initialisation import RestInitialiser
-from vioframe.loose_fusion import StartOptions
 from vioframe.types import Frame, ImuBlock, NavState, Tracks, VisualFeatures
 from vioframe_klt import KltFrontend
 from vioframe_recordings import KittiDataset

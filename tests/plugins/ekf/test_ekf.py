@@ -10,9 +10,10 @@ from filter_runs import assert_honest, benchmark, chi_square_interval, play, rec
 from vioframe.data.simulator import ImuSettings
 from vioframe.error_state import Body, InertialFilter, retract
 from vioframe.errors import ConfigError, StateError
+from vioframe.fusion_options import InertialOptions, StandstillOptions, StartOptions, VisualOptions
 from vioframe.geometry import se3, so3
 from vioframe.initialisation import initial_covariance
-from vioframe.loose_fusion import InertialOptions, StandstillOptions, StartOptions, VisualMotion, VisualOptions
+from vioframe.loose_fusion import VisualMotion
 from vioframe.testing import check_component
 from vioframe.types import ImuBias, ImuBlock, ImuNoise, InertialDelta, NavState, RelativePose, SensorRig
 from vioframe_ekf import EkfFuser

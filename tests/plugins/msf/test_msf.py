@@ -9,10 +9,10 @@ import pytest
 from filter_runs import assert_honest, benchmark, chi_square_interval, play, record, simulated, without_vo
 from vioframe.error_state import Body, retract
 from vioframe.errors import ConfigError
+from vioframe.fusion_options import StartOptions
 from vioframe.geometry import se3, so3
 from vioframe.geometry.interpolation import interpolate_poses
 from vioframe.initialisation import initial_covariance
-from vioframe.loose_fusion import StartOptions
 from vioframe.testing import check_component
 from vioframe.types import ImuBias, ImuNoise, NavState, RelativePose
 from vioframe_msf import DriftOptions, ExtrinsicsOptions, MsfFuser, ScaleOptions

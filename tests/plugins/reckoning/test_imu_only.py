@@ -9,8 +9,8 @@ from inertial_truth import NOISE, QUIET, even_stamps, make_rig, motion, samples,
 from shared_data import shared_data
 from vioframe.conventions import NANOSECONDS
 from vioframe.errors import ConfigError, StateError
+from vioframe.fusion_options import StandstillOptions
 from vioframe.geometry import so3
-from vioframe.loose_fusion import StandstillOptions
 from vioframe.testing import check_component
 from vioframe.types import ImuBias, ImuBlock, ImuNoise, Measurement, NavState, SensorRig, SyncedWindow
 from vioframe_preintegration import Preintegration
