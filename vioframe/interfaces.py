@@ -7,7 +7,7 @@ require it with no change here.
 
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from vioframe.checks import Array
@@ -17,6 +17,7 @@ from vioframe.types import (
     ImuBias,
     ImuBlock,
     InertialDelta,
+    InitialisationAttempt,
     Measurement,
     NavState,
     Packet,
@@ -29,6 +30,8 @@ from vioframe.types import (
 
 TRACKS, FLOW, EMBEDDING = "tracks", "flow", "embedding"
 """Fields of :class:`VisualFeatures`."""
+STEREO_TRACKS = "stereo_tracks"
+"""``VisualFeatures.stereo``."""
 IMAGES = "images"
 """Pixels in ``Frame.images``; provided by a recording whose rig has cameras."""
 STEREO = "stereo"
@@ -96,6 +99,9 @@ class Synchronizer(Component):
     def flush(self) -> list[SyncedWindow]:
         """The recording has ended: return what can still be completed."""
 
+    def assume_camera_delay(self, delay_ns: int) -> None:
+        """Stamp the frames to come with this delay (``t_imu = t_cam + delay``) instead of the rig's."""
+
 
 class Frontend(Component):
     """Turns an image into what a motion estimator can use."""
@@ -158,6 +164,14 @@ class Fuser(Component):
     def bias(self) -> ImuBias:
         """What the integrator should assume next."""
         return ImuBias()
+
+    def camera_delay_ns(self) -> int | None:
+        """What the synchronizer should assume next, where this method estimates it (``t_imu = t_cam + delay``)."""
+        return None
+
+    def attempts(self) -> Sequence[InitialisationAttempt]:
+        """Every attempt to start since ``setup``, oldest first, with what was missing."""
+        return ()
 
     def smoothed(self) -> Trajectory | None:
         """The final trajectory (``causal=False``), where the method has one."""

@@ -173,6 +173,9 @@ class Pipeline:
         started = time.perf_counter()
         states = self.fuser.update(measurement)
         self.timers["fuser"].add(started)
+        delay_ns = self.fuser.camera_delay_ns()
+        if delay_ns is not None:
+            self.synchronizer.assume_camera_delay(delay_ns)
         self._features = features
         self.windows += 1
         for observer in self._observers:

@@ -177,12 +177,14 @@ class SyncedWindow:
         previous, current: frames on the IMU clock.
         imu: with samples exactly at both stamps.
         gap_ns: longest time without a measured sample inside the window.
+        camera_delay_ns: what was added to the camera's stamp of ``current`` to bring it onto the IMU clock.
     """
 
     previous: Frame
     current: Frame
     imu: ImuBlock
     gap_ns: int
+    camera_delay_ns: int = 0
 
     def __post_init__(self) -> None:
         if self.imu.stamps_ns[0] != self.previous.stamp_ns or self.imu.stamps_ns[-1] != self.current.stamp_ns:
@@ -222,6 +224,17 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.ids)
 
+    @staticmethod
+    def none(camera: int = 0) -> "Tracks":
+        """No points at all."""
+        return Tracks(
+            ids=np.zeros(0, dtype=np.int64),
+            pixels=np.zeros((0, 2)),
+            bearings=np.zeros((0, 3)),
+            scores=np.zeros(0),
+            camera=camera,
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class VisualFeatures:
@@ -230,6 +243,8 @@ class VisualFeatures:
     Attributes:
         frame: the frame itself.
         tracks: of camera 0, or None.
+        stereo: the same points in camera 1 at the same instant, for those that were found there: its ids are
+            among those of ``tracks``. None where the front end looks at one camera only.
         flow: (H, W, 2) px from the previous image to this one, or None.
         embedding: (D,) or None.
         extras: fields a third party adds, by the name it puts in ``provides``.
@@ -237,6 +252,7 @@ class VisualFeatures:
 
     frame: Frame
     tracks: Tracks | None = None
+    stereo: Tracks | None = None
     flow: Array | None = None
     embedding: Array | None = None
     extras: Mapping[str, object] = field(default_factory=dict)
@@ -394,6 +410,44 @@ class NavState:
         check_array("NavState.v_world_body", self.v_world_body, (3,))
         if self.covariance is not None:
             check_array("NavState.covariance", self.covariance, (15, 15))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measure:
+    """One number that speaks for or against an initialisation.
+
+    Attributes:
+        value: in ``unit``.
+        unit: for people, such as "deg" or "m/s²"; empty for a ratio or a count.
+        limit: what the value is held against, or None where it only informs.
+        good: whether it lies on the right side of the limit.
+    """
+
+    value: float
+    unit: str = ""
+    limit: float | None = None
+    good: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class InitialisationAttempt:
+    """What an attempt to start found: the doctor's record.
+
+    Attributes:
+        stamp_ns: of the newest window it used, IMU clock.
+        method: ``rest``, ``motion`` or ``given``.
+        succeeded: whether the estimator started from it.
+        fault: short name of what is missing, such as "no rotation"; empty when it succeeded.
+        sentence: what, which value, what to do, for the log and the table.
+        measures: every number by name.
+    """
+
+    stamp_ns: int
+    method: str
+    succeeded: bool
+    fault: str = ""
+    sentence: str = ""
+    measures: Mapping[str, Measure] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -57,6 +57,7 @@ class BufferedSynchronizer(Synchronizer):
         self._blocks: deque[ImuBlock] = deque()
         self._newest_imu_ns: int | None = None
         self._waiting: list[Frame] = []
+        self._delays: dict[int, int] = {}
         self._previous: Frame | None = None
         self._newest_frame_ns: int | None = None
         self._intervals: deque[int] = deque(maxlen=_INTERVALS)
@@ -65,6 +66,10 @@ class BufferedSynchronizer(Synchronizer):
             {DROPPED_FRAMES: 0, MISSING_FRAMES: 0, INERTIAL_GAPS: 0, DROPPED_SAMPLES: 0}
         )
         self._ready = True
+
+    def assume_camera_delay(self, delay_ns: int) -> None:
+        """Stamp the frames to come with this delay; those that wait keep theirs."""
+        self._delay_ns = delay_ns
 
     def counters(self) -> Mapping[str, int]:
         """Frames dropped here, frames that never came, holes in the samples, samples out of order."""
@@ -106,6 +111,7 @@ class BufferedSynchronizer(Synchronizer):
         if self._delay_ns:
             frame = replace(frame, stamp_ns=frame.stamp_ns + self._delay_ns)
         stamp_ns = frame.stamp_ns
+        self._delays[stamp_ns] = self._delay_ns
         if self._newest_frame_ns is not None and stamp_ns > self._newest_frame_ns:
             self._count_missing(stamp_ns - self._newest_frame_ns, stamp_ns)
         self._newest_frame_ns = stamp_ns if self._newest_frame_ns is None else max(stamp_ns, self._newest_frame_ns)
@@ -189,7 +195,16 @@ class BufferedSynchronizer(Synchronizer):
         around = stamps_ns[first : last + 1]
         imu = self._cut(samples, previous.stamp_ns, current.stamp_ns)
         self._emitted = True
-        return SyncedWindow(previous=previous, current=current, imu=imu, gap_ns=int((around[1:] - around[:-1]).max()))
+        delay_ns = self._delays[current.stamp_ns]
+        waiting = {frame.stamp_ns for frame in self._waiting}
+        self._delays = {stamp_ns: delay for stamp_ns, delay in self._delays.items() if stamp_ns in waiting}
+        return SyncedWindow(
+            previous=previous,
+            current=current,
+            imu=imu,
+            gap_ns=int((around[1:] - around[:-1]).max()),
+            camera_delay_ns=delay_ns,
+        )
 
     def _joined(self) -> ImuBlock:
         if len(self._blocks) > 1:

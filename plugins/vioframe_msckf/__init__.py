@@ -1,0 +1,1 @@
+"""Multi-state constraint Kalman filter: tightly coupled visual-inertial odometry in numpy."""

@@ -1,0 +1,1 @@
+"""ORB keypoints matched by their binary descriptors, with lasting ids."""

@@ -1,0 +1,1 @@
+"""Tightly coupled fixed-lag smoother on gtsam, with loop closure."""

@@ -1,0 +1,218 @@
+"""The shell of a tightly coupled estimator: everything around its equations."""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from vioframe.consistency import StandstillTest
+from vioframe.error_state import Body
+from vioframe.errors import ConfigError, StateError
+from vioframe.fusion_options import StandstillOptions
+from vioframe.interfaces import INERTIAL_DELTA, TRACKS, Fuser
+from vioframe.tight.failure import FailureMonitor
+from vioframe.tight.options import CalibrationOptions, FailureOptions, InertialTrust
+from vioframe.tight.restart import DeadReckoning, coast_across
+from vioframe.tight.start import Starter, TightStartOptions
+from vioframe.tight.step import Start, Step, Support
+from vioframe.types import (
+    ImuBias,
+    InitialisationAttempt,
+    Measurement,
+    NavState,
+    SensorRig,
+    Status,
+    SyncedWindow,
+    Tracks,
+)
+
+
+class TightFuser(Fuser):
+    """Starts an estimator, moves it on window by window, watches it, and starts it again when it failed.
+
+    A method derives from this and says in :meth:`_begin` how it takes a first state, in :meth:`_advance` how a
+    window moves it on, and in :meth:`_estimate` what it believes.
+
+    Args:
+        inertial: trust in the inertial increments.
+        calibration: what of the calibration is estimated.
+        standstill: measuring no motion at rest.
+        start: how it begins.
+        failure: when it is not believed any more.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({INERTIAL_DELTA, TRACKS})
+
+    def __init__(
+        self,
+        *,
+        inertial: InertialTrust | None = None,
+        calibration: CalibrationOptions | None = None,
+        standstill: StandstillOptions | None = None,
+        start: TightStartOptions | None = None,
+        failure: FailureOptions | None = None,
+    ) -> None:
+        self._inertial = inertial or InertialTrust()
+        self._calibration = calibration or CalibrationOptions()
+        self._standstill = standstill or StandstillOptions()
+        self._start_options = start or TightStartOptions()
+        self._failure = failure or FailureOptions()
+        self._ready = False
+
+    def setup(self, rig: SensorRig) -> None:
+        """Forget the last sequence and take the next one's calibration.
+
+        Raises:
+            ConfigError: the rig has no camera.
+        """
+        if not rig.cameras:
+            raise ConfigError(
+                f"{type(self).__name__} follows image points and needs a calibrated camera, but the recording has "
+                "none: choose fuser=imu_only, or a recording with a camera"
+            )
+        self._rig = rig
+        self._noise = self._inertial.noise(rig.imu)
+        self._counts: dict[str, int] = {}
+        self._attempts: list[InitialisationAttempt] = []
+        self._stamp_ns: int | None = None
+        self._running = False
+        self._past: DeadReckoning | None = None
+        self._ready = True
+        self._new_start()
+
+    def start_from(self, state: NavState) -> None:
+        """Start from a given state; without a covariance the sigmas of ``start`` stand in."""
+        self._starter.give(state)
+
+    def bias(self) -> ImuBias:
+        """The estimated bias."""
+        return self._estimate().bias if self._ready and self._running else ImuBias()
+
+    def counters(self) -> Mapping[str, int]:
+        """Restarts, windows with holes, missing windows, standstill measurements, and what the method counts."""
+        return dict(self._counts)
+
+    def attempts(self) -> Sequence[InitialisationAttempt]:
+        """Every attempt to start since ``setup``, oldest first."""
+        return (*self._attempts, *self._starter.attempts)
+
+    def update(self, measurement: Measurement) -> list[NavState]:
+        """Move on by one window; empty until there is a first state, dead reckoned while starting again."""
+        if not self._ready:
+            raise StateError(f"{type(self).__name__}.update was called before setup(rig): set the fuser up first")
+        window = measurement.window
+        if self._stamp_ns is not None and self._stamp_ns != window.previous.stamp_ns:
+            self._cross_hole(window)
+        states: list[NavState] = []
+        if self._running:
+            self._move_on(measurement)
+        else:
+            if self._past is not None:
+                self._past.move_on(self._step(measurement, at_rest=False))
+            states = self._try_to_start(measurement)
+        self._stamp_ns = window.current.stamp_ns
+        if self._running:
+            states.append(replace(self._estimate(), stamp_ns=self._stamp_ns, status=self._status()))
+        elif self._past is not None:
+            states.append(self._past.state(self._stamp_ns))
+        return states
+
+    def _new_start(self) -> None:
+        self._starter = Starter(self._rig, self._start_options, self._calibration)
+        self._standstill_test: StandstillTest = self._standstill.test(self._rig)
+        self._monitor = FailureMonitor(self._failure)
+
+    def _try_to_start(self, measurement: Measurement) -> list[NavState]:
+        """Give the window to the starter; where it has a start, begin there and go through what it has seen."""
+        start = self._starter.push(measurement)
+        if start is None:
+            return []
+        state = start.state
+        if self._past is not None:
+            state = self._past.brought_into_frame(state)
+            self._count("restarts")
+        self._begin(replace(start, state=state))
+        self._running = True
+        self._past = None
+        self._monitor.begin(state)
+        before = []
+        if state.stamp_ns == measurement.window.previous.stamp_ns and self._stamp_ns is None:
+            before = [replace(self._estimate(), stamp_ns=state.stamp_ns, status="tracking")]
+        for past in start.replay:
+            if self._running:
+                self._move_on(past)
+        return before
+
+    def _move_on(self, measurement: Measurement) -> None:
+        step = self._prepare(measurement)
+        before = self._estimate()
+        support = self._advance(step)
+        after = self._estimate()
+        if support.at_rest:
+            self._count("standstill updates")
+        reason = self._monitor.judge(step, before, after, support)
+        if reason is not None:
+            self._count(f"failures: {reason}")
+            if self._failure.restart:
+                self._past = self._monitor.dead_reckoning(self._noise, self._rig.gravity)
+                self._running = False
+                self._attempts += self._starter.attempts
+                self._new_start()
+
+    def _prepare(self, measurement: Measurement) -> Step:
+        body = Body.of(self._estimate())
+        at_rest = self._standstill_test.push(measurement.window, body) and self._standstill.enabled
+        if self._inertial.has_gap(measurement.window.gap_ns):
+            self._count("inertial gaps")
+        return self._step(measurement, at_rest=at_rest)
+
+    def _step(self, measurement: Measurement, *, at_rest: bool) -> Step:
+        delta, features = measurement.inertial_delta, measurement.features
+        if delta is None:
+            raise StateError(f"{type(self).__name__}.update needs an inertial increment: set integrator=preintegration")
+        bias = self.bias()
+        if not (np.array_equal(delta.bias.gyro, bias.gyro) and np.array_equal(delta.bias.accel, bias.accel)):
+            delta = delta.at(bias)
+        return Step(
+            window=measurement.window,
+            delta=self._inertial.trusted(delta, measurement.window.gap_ns),
+            tracks=Tracks.none() if features is None or features.tracks is None else features.tracks,
+            stereo=None if features is None else features.stereo,
+            at_rest=at_rest,
+        )
+
+    def _cross_hole(self, window: SyncedWindow) -> None:
+        """Cross a stretch for which no window came, at constant velocity and with little trust in it."""
+        self._count("missing windows")
+        if self._stamp_ns is None:
+            return
+        if not self._running:
+            self._starter.interrupt()
+            if self._past is None:
+                return
+        state = self._past.state(self._stamp_ns) if self._past is not None else self._estimate()
+        hole = coast_across(state, window, self._rig.gravity, self._inertial)
+        if self._past is not None:
+            self._past.move_on(self._step(hole, at_rest=False))
+        else:
+            self._move_on(hole)
+
+    def _status(self) -> Status:
+        return "lost" if self._monitor.is_lost else "tracking"
+
+    def _count(self, what: str, by: int = 1) -> None:
+        self._counts[what] = self._counts.get(what, 0) + by
+
+    @abstractmethod
+    def _begin(self, start: Start) -> None:
+        """Forget everything and take a first state, and the calibration where the start found one."""
+
+    @abstractmethod
+    def _advance(self, step: Step) -> Support:
+        """Move the estimate on to ``step.stamp_ns``, with what the images say."""
+
+    @abstractmethod
+    def _estimate(self) -> NavState:
+        """The newest state, with its covariance."""

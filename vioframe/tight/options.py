@@ -1,0 +1,162 @@
+"""The options that tightly coupled estimators share, in small groups, which the plugins' YAML files nest."""
+
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+
+from vioframe.conventions import NANOSECONDS, seconds
+from vioframe.errors import ConfigError
+from vioframe.increments import add_gap
+from vioframe.types import ImuNoise, InertialDelta
+
+Extrinsics = Literal["fixed", "refine", "find"]
+
+
+def _check_positive(group: str, **values: float) -> None:
+    for name, value in values.items():
+        if not value > 0.0:
+            raise ConfigError(f"fuser.{group}.{name} must be positive, got {value}")
+
+
+def _check_not_negative(group: str, **values: float) -> None:
+    for name, value in values.items():
+        if not value >= 0.0:
+            raise ConfigError(f"fuser.{group}.{name} must not be negative, got {value}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InertialTrust:
+    """How far the inertial increments are believed.
+
+    Attributes:
+        gyro_noise_scale: factor on the gyro's white noise density of the rig. A data sheet states that of a
+            sensor that does not shake.
+        accel_noise_scale: factor on the accelerometer's.
+        gyro_walk_scale: factor on the gyro bias walk density.
+        accel_walk_scale: factor on the accelerometer bias walk density.
+        gap_allowed_s: a longer hole between samples widens the covariance.
+        gap_rate_sigma: rad/s, unknown rate inside such a hole.
+        gap_accel_sigma: m/s², unknown acceleration inside such a hole.
+    """
+
+    gyro_noise_scale: float = 1.0
+    accel_noise_scale: float = 1.0
+    gyro_walk_scale: float = 1.0
+    accel_walk_scale: float = 1.0
+    gap_allowed_s: float = 0.05
+    gap_rate_sigma: float = 0.5
+    gap_accel_sigma: float = 2.0
+
+    def __post_init__(self) -> None:
+        _check_positive(
+            "inertial",
+            gyro_noise_scale=self.gyro_noise_scale,
+            accel_noise_scale=self.accel_noise_scale,
+            gap_allowed_s=self.gap_allowed_s,
+        )
+        _check_not_negative(
+            "inertial",
+            gyro_walk_scale=self.gyro_walk_scale,
+            accel_walk_scale=self.accel_walk_scale,
+            gap_rate_sigma=self.gap_rate_sigma,
+            gap_accel_sigma=self.gap_accel_sigma,
+        )
+
+    def noise(self, stated: ImuNoise) -> ImuNoise:
+        """The densities to work with."""
+        return replace(
+            stated,
+            gyro_noise=stated.gyro_noise * self.gyro_noise_scale,
+            accel_noise=stated.accel_noise * self.accel_noise_scale,
+            gyro_walk=stated.gyro_walk * self.gyro_walk_scale,
+            accel_walk=stated.accel_walk * self.accel_walk_scale,
+        )
+
+    def has_gap(self, gap_ns: int) -> bool:
+        """Whether a hole of this length widens the covariance."""
+        return gap_ns > round(self.gap_allowed_s * NANOSECONDS)
+
+    def trusted(self, delta: InertialDelta, gap_ns: int) -> InertialDelta:
+        """The increment with the scaled covariance, widened for a hole; that of v and p is the accelerometer's."""
+        factor = np.repeat([self.gyro_noise_scale, self.accel_noise_scale, self.accel_noise_scale], 3)
+        delta = replace(delta, covariance=factor[:, None] * delta.covariance * factor)
+        if self.has_gap(gap_ns):
+            return add_gap(delta, seconds(gap_ns), self.gap_rate_sigma, self.gap_accel_sigma)
+        return delta
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationOptions:
+    """What of the calibration is estimated while it runs.
+
+    Attributes:
+        extrinsics: place of the cameras on the body: ``fixed`` as calibrated, ``refine`` from there, or ``find``
+            the rotation of camera 0 from nothing before the start, then refine.
+        rotation_sigma: rad an axis, of the calibrated rotation.
+        position_sigma: m an axis, of the calibrated position.
+        time_offset: estimate the camera's delay.
+        time_offset_sigma_s: s, of the delay that the rig states.
+    """
+
+    extrinsics: Extrinsics = "refine"
+    rotation_sigma: float = 0.02
+    position_sigma: float = 0.01
+    time_offset: bool = True
+    time_offset_sigma_s: float = 0.01
+
+    def __post_init__(self) -> None:
+        if self.extrinsics not in get_args(Extrinsics):
+            raise ConfigError(
+                f"fuser.calibration.extrinsics must be one of {', '.join(get_args(Extrinsics))}, "
+                f"got {self.extrinsics!r}"
+            )
+        _check_positive(
+            "calibration",
+            rotation_sigma=self.rotation_sigma,
+            position_sigma=self.position_sigma,
+            time_offset_sigma_s=self.time_offset_sigma_s,
+        )
+
+    @property
+    def estimates_extrinsics(self) -> bool:
+        """Whether the cameras' place on the body is part of the state."""
+        return self.extrinsics != "fixed"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FailureOptions:
+    """When an estimate is not believed any more.
+
+    Attributes:
+        min_used: fewer observations used in a window do not support its state.
+        lost_after_s: seconds without support, moving, after which the status is ``lost``.
+        restart_after_s: seconds without support although points are tracked, after which it starts again.
+        max_gyro_bias: rad/s; a larger estimate is a failure.
+        max_accel_bias: m/s².
+        max_speed: m/s.
+        max_correction_m: m by which the images of one window may move the position.
+        restart: start again after a failure, keeping the frame of the trajectory; else stay ``lost``.
+    """
+
+    min_used: int = 4
+    lost_after_s: float = 1.0
+    restart_after_s: float = 2.0
+    max_gyro_bias: float = 1.0
+    max_accel_bias: float = 2.5
+    max_speed: float = 60.0
+    max_correction_m: float = 5.0
+    restart: bool = True
+
+    def __post_init__(self) -> None:
+        if self.min_used < 1:
+            raise ConfigError(f"fuser.failure.min_used must be at least 1, got {self.min_used}")
+        _check_positive(
+            "failure",
+            lost_after_s=self.lost_after_s,
+            restart_after_s=self.restart_after_s,
+            max_gyro_bias=self.max_gyro_bias,
+            max_accel_bias=self.max_accel_bias,
+            max_speed=self.max_speed,
+            max_correction_m=self.max_correction_m,
+        )
