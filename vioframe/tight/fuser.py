@@ -1,5 +1,6 @@
 """The shell of a tightly coupled estimator: everything around its equations."""
 
+import logging
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -9,7 +10,7 @@ import numpy as np
 
 from vioframe.consistency import StandstillTest
 from vioframe.error_state import Body
-from vioframe.errors import ConfigError, StateError
+from vioframe.errors import ConfigError, ShapeError, StateError
 from vioframe.fusion_options import StandstillOptions
 from vioframe.interfaces import INERTIAL_DELTA, TRACKS, Fuser
 from vioframe.tight.failure import FailureMonitor
@@ -27,6 +28,8 @@ from vioframe.types import (
     SyncedWindow,
     Tracks,
 )
+
+log = logging.getLogger(__name__)
 
 
 class TightFuser(Fuser):
@@ -87,8 +90,12 @@ class TightFuser(Fuser):
         self._starter.give(state)
 
     def bias(self) -> ImuBias:
-        """The estimated bias."""
-        return self._estimate().bias if self._ready and self._running else ImuBias()
+        """The estimated bias; while it starts again, that of the dead reckoning."""
+        if not self._ready:
+            return ImuBias()
+        if self._running:
+            return self._estimate().bias
+        return ImuBias() if self._past is None else self._past.bias
 
     def counters(self) -> Mapping[str, int]:
         """Restarts, windows with holes, missing windows, standstill measurements, and what the method counts."""
@@ -126,6 +133,8 @@ class TightFuser(Fuser):
 
     def _try_to_start(self, measurement: Measurement) -> list[NavState]:
         """Give the window to the starter; where it has a start, begin there and go through what it has seen."""
+        if self._past is not None and not self._failure.restart:
+            return []
         start = self._starter.push(measurement)
         if start is None:
             return []
@@ -148,18 +157,31 @@ class TightFuser(Fuser):
     def _move_on(self, measurement: Measurement) -> None:
         step = self._prepare(measurement)
         before = self._estimate()
-        support = self._advance(step)
-        after = self._estimate()
-        if support.at_rest:
-            self._count("standstill updates")
-        reason = self._monitor.judge(step, before, after, support)
+        try:
+            support = self._advance(step)
+            reason = self._monitor.judge(step, before, self._estimate(), support)
+        except (ShapeError, np.linalg.LinAlgError):
+            # A NavState refuses what is not finite, and a covariance that is none has no factor.
+            reason = self._monitor.note_collapse(step)
+        else:
+            if support.at_rest:
+                self._count("standstill updates")
         if reason is not None:
-            self._count(f"failures: {reason}")
-            if self._failure.restart:
-                self._past = self._monitor.dead_reckoning(self._noise, self._rig.gravity)
-                self._running = False
-                self._attempts += self._starter.attempts
-                self._new_start()
+            self._give_up(reason)
+
+    def _give_up(self, reason: str) -> None:
+        """Believe the estimate no more: dead reckon from before it failed, and look for a new start."""
+        self._count(f"failures: {reason}")
+        log.warning(
+            "%s: the estimate failed (%s) at %s ns; dead reckoning until it starts again",
+            type(self).__name__,
+            reason,
+            self._stamp_ns,
+        )
+        self._past = self._monitor.dead_reckoning(self._noise, self._rig.gravity)
+        self._running = False
+        self._attempts += self._starter.attempts
+        self._new_start()
 
     def _prepare(self, measurement: Measurement) -> Step:
         body = Body.of(self._estimate())

@@ -10,7 +10,7 @@ from vioframe.geometry import so3
 from vioframe.increments import coasting
 from vioframe.tight.options import InertialTrust
 from vioframe.tight.step import Step
-from vioframe.types import ImuBlock, ImuNoise, Measurement, NavState, SyncedWindow
+from vioframe.types import ImuBias, ImuBlock, ImuNoise, Measurement, NavState, SyncedWindow
 
 # A starter looks back over its window, a few seconds.
 _HISTORY = 400
@@ -29,6 +29,11 @@ class DeadReckoning:
         self._filter = InertialFilter(extra=0, noise=noise, gravity=gravity)
         self._filter.start(state, 1e-6 * np.eye(15) if state.covariance is None else state.covariance)
         self._states = {state.stamp_ns: self._filter.nav_state(state.stamp_ns, "lost")}
+
+    @property
+    def bias(self) -> ImuBias:
+        """The bias of the state it began from."""
+        return self._filter.body.bias
 
     def move_on(self, step: Step) -> None:
         """Move on by one window."""
