@@ -97,6 +97,25 @@ def test_unmet_need_names_the_physics_and_all_choices():
     assert "frontend=klt" in message and "vo=none" in message and "integrator=none" in message
 
 
+def test_delay_that_the_fuser_finds_reaches_the_synchronizer():
+    class Told(Replay):
+        told = ()
+
+        def assume_camera_delay(self, delay_ns):
+            self.told = (*self.told, delay_ns)
+
+    class Finds(Keep):
+        def camera_delay_ns(self):
+            return len(self.measurements) * 1000
+
+    for fuser, expected in ((Finds(), tuple(range(1000, 1000 * len(SCENE.windows) + 1, 1000))), (Keep(), ())):
+        synchronizer = Told()
+        pipeline = Pipeline(synchronizer=synchronizer, fuser=fuser)
+        pipeline.setup(SCENE.rig)
+        list(pipeline.run(SCENE.packets()))
+        assert synchronizer.told == expected
+
+
 def test_strangers_name_is_exchanged_without_the_core_knowing_it():
     pipeline = Pipeline(synchronizer=Replay(), frontend=Sight(), fuser=NeedsDepth())
     pipeline.setup(SCENE.rig)

@@ -109,6 +109,21 @@ def test_frames_on_the_samples_need_no_others(cls: type[Synchronizer]) -> None:
 
 
 @pytest.mark.parametrize("cls", BOTH)
+def test_a_delay_found_on_the_way_holds_for_the_frames_to_come(cls: type[Synchronizer]) -> None:
+    """A frame that already waits keeps its stamp; windows still follow each other, and say what they contain."""
+    synchronizer = started(cls, delay_ms=5.0)
+    windows = run(synchronizer, [block(np.arange(0.0, 61.0, 5.0)), frame(0), frame(50)])
+    synchronizer.push(frame(100))
+    synchronizer.assume_camera_delay(15 * MS)
+    windows += run(synchronizer, [frame(150), block(np.arange(65.0, 201.0, 5.0))])
+    assert ends(windows) == [(5.0, 55.0), (55.0, 105.0), (105.0, 165.0)]
+    assert [window.camera_delay_ns / MS for window in windows] == [5.0, 5.0, 15.0]
+    synchronizer.setup(make_rig(NOISE, camera_delay_ns=5 * MS))
+    windows = run(synchronizer, [block(np.arange(0.0, 61.0, 5.0)), frame(0), frame(50)])
+    assert ends(windows) == [(5.0, 55.0)]
+
+
+@pytest.mark.parametrize("cls", BOTH)
 def test_the_camera_delay_moves_frames_to_the_imu_clock(cls: type[Synchronizer]) -> None:
     synchronizer = started(cls, delay_ms=7.0)
     picture = np.zeros((4, 4), dtype=np.uint8)
