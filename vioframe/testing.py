@@ -22,6 +22,7 @@ from vioframe.interfaces import (
     FLOW,
     METRIC_SCALE,
     RELATIVE_POSE,
+    STEREO_TRACKS,
     TRACKS,
     Component,
     Frontend,
@@ -252,7 +253,15 @@ def _check_frontend(component: Component, scene: Scene) -> list[Array]:
         for field in (TRACKS, FLOW, EMBEDDING):
             if field in component.provides:
                 _expect(getattr(features, field) is not None, f"{name} provides {field}, but left it None")
-        extras = component.provides - {TRACKS, FLOW, EMBEDDING}
+        if STEREO_TRACKS in component.provides:
+            _expect(features.stereo is not None, f"{name} provides {STEREO_TRACKS}, but left stereo None")
+        if features.stereo is not None and features.tracks is not None:
+            _expect(
+                set(features.stereo.ids.tolist()) <= set(features.tracks.ids.tolist()),
+                f"{name} gave a point of camera 1 an id that no point of camera 0 has",
+            )
+            _expect(features.stereo.camera == 1, f"{name} must say that its stereo tracks are of camera 1")
+        extras = component.provides - {TRACKS, FLOW, EMBEDDING, STEREO_TRACKS}
         _expect(
             extras <= set(features.extras),
             f"{name} provides {sorted(extras)}, but extras has {sorted(features.extras)}",

@@ -10,10 +10,11 @@ import numpy as np
 from vioframe.checks import Array
 from vioframe.errors import ConfigError, DataError, ShapeError, StateError
 from vioframe.geometry import camera as projection
-from vioframe.interfaces import TRACKS, Frontend
+from vioframe.interfaces import IMAGES, STEREO, STEREO_TRACKS, TRACKS, Frontend
 from vioframe.types import Camera, Frame, Image, SensorRig, Tracks, VisualFeatures
 from vioframe_klt.detector import CornerDetector
 from vioframe_klt.outliers import epipolar_inliers
+from vioframe_klt.stereo import StereoMatcher
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +37,8 @@ class KltFrontend(Frontend):
     renewed when the view has moved; frame-to-frame tracking is the special case ``reference_flow_px=0``.
 
     Args:
+        stereo: also find the points in camera 1.
+        min_depth: nearer points are not looked for there, m.
         max_points: most points followed at once.
         min_distance_px: between points, when new ones are taken.
         quality: fraction of the strongest corner's smaller eigenvalue a corner needs.
@@ -66,6 +69,8 @@ class KltFrontend(Frontend):
     def __init__(
         self,
         *,
+        stereo: bool = False,
+        min_depth: float = 0.4,
         max_points: int = 180,
         min_distance_px: float = 22.0,
         quality: float = 0.01,
@@ -87,6 +92,7 @@ class KltFrontend(Frontend):
         border_px: int = 8,
         max_angle_deg: float | None = None,
     ) -> None:
+        _require("min_depth", min_depth, min_depth > 0.0, "positive")
         _require("max_points", max_points, max_points >= 1, "at least 1")
         _require("min_distance_px", min_distance_px, min_distance_px >= 2.0, "at least 2")
         _require("quality", quality, 0.0 < quality < 1.0, "between 0 and 1")
@@ -104,6 +110,12 @@ class KltFrontend(Frontend):
         _require("border_px", border_px, border_px >= 1, "at least 1")
         if max_angle_deg is not None:
             _require("max_angle_deg", max_angle_deg, 0.0 < max_angle_deg < 90.0, "between 0 and 90, or null")
+        if stereo:
+            # What it needs and gives depends on its options, so the instance says it, not the class.
+            self.requires = frozenset({IMAGES, STEREO})  # type: ignore[misc]
+            self.provides = frozenset({TRACKS, STEREO_TRACKS})  # type: ignore[misc]
+        self._stereo = stereo
+        self._min_depth = min_depth
         self._max_points = max_points
         self._min_distance = min_distance_px
         self._quality = quality
@@ -127,7 +139,8 @@ class KltFrontend(Frontend):
         """Forget all points; ids start again at 0.
 
         Raises:
-            DataError: the rig has no camera, or ``border_px`` leaves nothing of its image.
+            DataError: the rig has no camera, or one where stereo needs two; or ``border_px`` leaves nothing of its
+                image.
         """
         if not rig.cameras:
             raise DataError("frontend=klt needs a camera, but the recording's calibration has none")
@@ -139,6 +152,7 @@ class KltFrontend(Frontend):
                 f"{width}×{height} px: make them smaller"
             )
         self._camera = camera
+        self._matcher = self._stereo_matcher(rig) if self._stereo else None
         allowed = np.zeros((height, width), np.uint8)
         inner = slice(self._border, height - self._border), slice(self._border, width - self._border)
         allowed[inner] = 255
@@ -174,7 +188,7 @@ class KltFrontend(Frontend):
         """
         if self._camera is None:
             raise StateError("KltFrontend.process was called before setup(rig): set it up first")
-        gray = self._prepare(frame, self._camera)
+        gray = self._prepare(frame, 0, self._camera)
         points = self._points
         if self._reference is not None and len(points):
             points = self._follow(self._reference, gray, points, R_prev_cur, self._camera)
@@ -198,7 +212,28 @@ class KltFrontend(Frontend):
             bearings=projection.bearings(self._camera, points.pixels),
             scores=points.ages.astype(float),
         )
-        return VisualFeatures(frame=frame, tracks=tracks)
+        if self._matcher is None:
+            return VisualFeatures(frame=frame, tracks=tracks)
+        right = self._prepare(frame, 1, self._matcher.right)
+        return VisualFeatures(frame=frame, tracks=tracks, stereo=self._matcher.match(gray, right, tracks))
+
+    def _stereo_matcher(self, rig: SensorRig) -> StereoMatcher:
+        if len(rig.cameras) < 2:
+            raise DataError(
+                f"frontend.stereo=true needs two cameras, but the recording's calibration has {len(rig.cameras)}: use "
+                "rig=stereo where it has them, or frontend.stereo=false"
+            )
+        return StereoMatcher(
+            rig.cameras[0],
+            rig.cameras[1],
+            window_px=self._window[0],
+            levels=self._levels,
+            criteria=self._criteria,
+            forward_backward_px=self._back_px,
+            epipolar_px=self._outlier_px,
+            min_depth=self._min_depth,
+            border_px=self._border,
+        )
 
     def _usable(self, camera: Camera) -> np.ndarray:
         """Every fourth pixel (H/4, W/4) uint8: 255 where the camera model can be inverted and the angle is allowed."""
@@ -215,13 +250,16 @@ class KltFrontend(Frontend):
         mask: np.ndarray = usable.astype(np.uint8) * 255
         return mask
 
-    def _prepare(self, frame: Frame, camera: Camera) -> Image:
-        if not frame.images:
-            raise DataError(f"frame at {frame.stamp_ns} ns has no image, and frontend=klt needs one")
-        image = frame.images[0]
+    def _prepare(self, frame: Frame, index: int, camera: Camera) -> Image:
+        if len(frame.images) <= index:
+            raise DataError(
+                f"frame at {frame.stamp_ns} ns has no image of camera {index}, and frontend=klt needs "
+                f"{'one' if index == 0 else 'both where stereo=true'}"
+            )
+        image = frame.images[index]
         if image.shape[:2] != camera.size_px[::-1]:
             raise ShapeError(
-                f"image of camera 0 at {frame.stamp_ns} ns is {image.shape[1]}×{image.shape[0]} px, but its "
+                f"image of camera {index} at {frame.stamp_ns} ns is {image.shape[1]}×{image.shape[0]} px, but its "
                 f"calibration says {camera.size_px[0]}×{camera.size_px[1]}: correct the calibration or the images"
             )
         gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
