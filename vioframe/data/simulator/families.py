@@ -14,7 +14,8 @@ import numpy as np
 from vioframe.checks import Array
 from vioframe.conventions import GRAVITY
 from vioframe.data.simulator.drive import plan_drive
-from vioframe.data.simulator.plan import Place, PlannedMotion, own_time, rotation_from_angles, start_rest
+from vioframe.data.simulator.patrol import plan_patrol
+from vioframe.data.simulator.plan import Place, PlannedMotion, own_time, rotation_from_angles, start_rest, sway
 from vioframe.data.simulator.spline import SplineMotion, control_times
 from vioframe.errors import ConfigError
 
@@ -39,16 +40,6 @@ class FamilyTraits:
     kit: Kit = "euroc"
     duration_s: float = 30.0
     standstill_s: float = 2.0
-
-
-def _sway(rng: np.random.Generator, time: Array, amplitude: float, low_hz: float, high_hz: float) -> Array:
-    """Three incommensurate waves (N,) between two frequencies, at most ``amplitude`` high."""
-    frequencies = rng.uniform(low_hz, high_hz, 3)
-    phases = rng.uniform(0.0, 2.0 * np.pi, 3)
-    weights = rng.dirichlet(np.full(3, 4.0)) * amplitude
-    waves = np.sin(2.0 * np.pi * frequencies * time[:, None] + phases)
-    total: Array = waves @ weights
-    return total
 
 
 def _loop(
@@ -77,17 +68,17 @@ def _held_walk(rng: np.random.Generator, time: Array) -> tuple[Array, Array]:
     step = rng.uniform(0.0, 2.0 * np.pi)
     position = np.stack(
         [
-            x + _sway(rng, time, 0.12, 0.3, 0.8),
-            y + _sway(rng, time, 0.12, 0.3, 0.8),
+            x + sway(rng, time, 0.12, 0.3, 0.8),
+            y + sway(rng, time, 0.12, 0.3, 0.8),
             # Steps lift the body a centimetre or so, twice a second.
-            1.45 + _sway(rng, time, 0.18, 0.2, 0.6) + 0.012 * np.sin(2.0 * np.pi * 1.9 * time + step),
+            1.45 + sway(rng, time, 0.18, 0.2, 0.6) + 0.012 * np.sin(2.0 * np.pi * 1.9 * time + step),
         ],
         axis=-1,
     )
     rotation = rotation_from_angles(
-        heading + _sway(rng, time, 0.5, 0.05, 0.18),
-        0.08 + _sway(rng, time, 0.2, 0.1, 0.5),
-        _sway(rng, time, 0.14, 0.1, 0.6),
+        heading + sway(rng, time, 0.5, 0.05, 0.18),
+        0.08 + sway(rng, time, 0.2, 0.1, 0.5),
+        sway(rng, time, 0.14, 0.1, 0.6),
     )
     return position, rotation
 
@@ -117,9 +108,9 @@ def _rotation(rng: np.random.Generator, duration_s: float, standstill_s: float) 
     time = own_time(times, start_rest(standstill_s), _KNOT_S)
     position = np.broadcast_to(np.array([0.0, 0.0, 1.5]), (len(time), 3)).copy()
     rotation = rotation_from_angles(
-        rng.uniform(-np.pi, np.pi) + rng.choice([-1.0, 1.0]) * 0.25 * time + _sway(rng, time, 0.8, 0.05, 0.2),
-        0.05 + _sway(rng, time, 0.3, 0.1, 0.4),
-        _sway(rng, time, 0.25, 0.1, 0.4),
+        rng.uniform(-np.pi, np.pi) + rng.choice([-1.0, 1.0]) * 0.25 * time + sway(rng, time, 0.8, 0.05, 0.2),
+        0.05 + sway(rng, time, 0.3, 0.1, 0.4),
+        sway(rng, time, 0.25, 0.1, 0.4),
     )
     return PlannedMotion(motion=SplineMotion(knot_s=_KNOT_S, positions=position, rotations=rotation), place="room")
 
@@ -151,7 +142,7 @@ def _drone(rng: np.random.Generator, duration_s: float, standstill_s: float) -> 
         - 2.0 * position
         + fly(own_time(times - step, start_rest(standstill_s), _KNOT_S))
     ) / step**2
-    yaw = phases[3] + hand * 0.35 * time + _sway(rng, time, 0.7, 0.05, 0.15)
+    yaw = phases[3] + hand * 0.35 * time + sway(rng, time, 0.7, 0.05, 0.15)
     ahead = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1)
     thrust = acceleration + np.array([0.0, 0.0, GRAVITY])
     up = thrust / np.linalg.norm(thrust, axis=-1, keepdims=True)
@@ -183,15 +174,15 @@ def _corridor(rng: np.random.Generator, duration_s: float, standstill_s: float) 
     position = np.stack(
         [
             x,
-            _sway(rng, time, 0.3, 0.05, 0.3),
-            1.5 + _sway(rng, time, 0.08, 0.2, 0.5) + 0.012 * np.sin(2.0 * np.pi * 1.9 * time + step),
+            sway(rng, time, 0.3, 0.05, 0.3),
+            1.5 + sway(rng, time, 0.08, 0.2, 0.5) + 0.012 * np.sin(2.0 * np.pi * 1.9 * time + step),
         ],
         axis=-1,
     )
     rotation = rotation_from_angles(
-        heading + _sway(rng, time, 0.2, 0.05, 0.3),
-        0.05 + _sway(rng, time, 0.1, 0.1, 0.5),
-        _sway(rng, time, 0.08, 0.1, 0.6),
+        heading + sway(rng, time, 0.2, 0.05, 0.3),
+        0.05 + sway(rng, time, 0.1, 0.1, 0.5),
+        sway(rng, time, 0.08, 0.1, 0.6),
     )
     return PlannedMotion(motion=SplineMotion(knot_s=_KNOT_S, positions=position, rotations=rotation), place="corridor")
 
@@ -205,6 +196,7 @@ FAMILIES: dict[str, tuple[FamilyTraits, Builder]] = {
     "drone": (FamilyTraits(place="hall"), _drone),
     "corridor": (FamilyTraits(place="corridor", duration_s=70.0), _corridor),
     "car": (FamilyTraits(place="street", kit="kitti", duration_s=110.0), plan_drive),
+    "building": (FamilyTraits(place="building", duration_s=115.0), plan_patrol),
 }
 """Name → traits and builder (generator, duration_s, standstill_s)."""
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vioframe.checks import Array
+from vioframe.data.simulator.building import build_building
 from vioframe.data.simulator.cameras import CameraSettings
 from vioframe.data.simulator.degrade import Degradations
 from vioframe.data.simulator.drive import BODY_HEIGHT_M
@@ -35,6 +36,14 @@ def build_world(plan: PlannedMotion, seed: int, duration_s: float, degradations:
             rng,
             path,
             camera_height_m=BODY_HEIGHT_M,
+            contrast=1.0 - degradations.low_texture,
+            moving=int(degradations.moving_objects),
+        )
+    if plan.place == "building":
+        return build_building(
+            rng,
+            path,
+            path if plan.route is None else plan.route,
             contrast=1.0 - degradations.low_texture,
             moving=int(degradations.moving_objects),
         )

@@ -9,7 +9,7 @@ from vioframe.checks import Array
 from vioframe.data.simulator.spline import SplineMotion
 from vioframe.geometry import so3
 
-Place = Literal["room", "hall", "corridor", "street"]
+Place = Literal["room", "hall", "corridor", "building", "street"]
 
 _RAMP_S = 1.0
 
@@ -21,10 +21,13 @@ class PlannedMotion:
     Attributes:
         motion: of the body.
         place: kind of world.
+        route: (N, 3) m, the whole way that the place is built around, where it goes on beyond the motion; a closed
+            polygon for a building.
     """
 
     motion: SplineMotion
     place: Place
+    route: Array | None = None
 
 
 def rotation_from_angles(yaw: Array, pitch: Array, roll: Array) -> Array:
@@ -65,3 +68,13 @@ def start_rest(standstill_s: float) -> list[tuple[float, float]]:
     """The rest (from, to) in s before the motion sets out; none where it starts under way."""
     # From well before zero, where control points lie that shape the first instant.
     return [(-10.0, standstill_s)] if standstill_s > 0.0 else []
+
+
+def sway(rng: np.random.Generator, time: Array, amplitude: float, low_hz: float, high_hz: float) -> Array:
+    """Three incommensurate waves (N,) between two frequencies, at most ``amplitude`` high."""
+    frequencies = rng.uniform(low_hz, high_hz, 3)
+    phases = rng.uniform(0.0, 2.0 * np.pi, 3)
+    weights = rng.dirichlet(np.full(3, 4.0)) * amplitude
+    waves = np.sin(2.0 * np.pi * frequencies * time[:, None] + phases)
+    total: Array = waves @ weights
+    return total

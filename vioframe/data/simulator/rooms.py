@@ -77,21 +77,41 @@ class RoomBuilder:
         skins.append(Skin(texture=self._fitted(materials.ceiling, size[0], size[1], 0.25)))
         self.plan.add_solid(self._low, self._high, skins)
 
-    def prepare_furniture(self) -> None:
-        """Paint what furniture is made of."""
+    def add_block(self, low: Array, high: Array) -> None:
+        """A block of masonry between two corners (3,), from floor to ceiling."""
+        base = float(self._rng.uniform(125, 180))
+
+        def paint_wall(rng: np.random.Generator, shape: tuple[int, int], ppm: float) -> np.ndarray:
+            return materials.wall(rng, shape, ppm, windows=False, base=base)
+
+        unseen = Skin(texture=0, origin=(0.0, 0.0))
+        skins = []
+        for axis in (0, 1):
+            for corner, shell in ((low, self._low), (high, self._high)):
+                against_shell = abs(corner[axis] - shell[axis]) < 1e-6
+                size = (high - low)[1 - axis], (high - low)[2]
+                skins.append(unseen if against_shell else Skin(texture=self._fitted(paint_wall, *size)))
+        self.plan.add_solid(low, high, [*skins, unseen, unseen])
+        self._taken.append((low, high))
+
+    def prepare_furniture(self, variety: int = 1) -> None:
+        """Paint what furniture is made of, ``variety`` times as many pictures of each kind."""
         ppm = 1.2 * self._ppm
 
         def shape(width: float, height: float) -> tuple[int, int]:
             return round(height * ppm), round(width * ppm)
 
+        def many(count: int) -> range:
+            return range(count * variety)
+
         rng = self._rng
-        self._books = [self._texture(materials.books(rng, shape(1.6, 2.1), ppm), ppm) for _ in range(2)]
-        self._fronts = [self._texture(materials.drawers(rng, shape(1.0, 1.2), ppm), ppm) for _ in range(2)]
-        self._cartons = [self._texture(materials.carton(rng, shape(0.7, 0.6), ppm), ppm) for _ in range(3)]
+        self._books = [self._texture(materials.books(rng, shape(1.6, 2.1), ppm), ppm) for _ in many(2)]
+        self._fronts = [self._texture(materials.drawers(rng, shape(1.0, 1.2), ppm), ppm) for _ in many(2)]
+        self._cartons = [self._texture(materials.carton(rng, shape(0.7, 0.6), ppm), ppm) for _ in many(3)]
         self._boards = [self._texture(materials.planks(rng, shape(1.2, 1.2), ppm, b, 0.2), ppm) for b in (85.0, 140.0)]
         self._cloth = self._texture(materials.fabric(rng, shape(1.2, 1.2), ppm), ppm)
         self._tiled = self._texture(materials.tiles(rng, shape(1.2, 1.2), ppm, 150.0, 0.2), ppm)
-        self._posters = [self._texture(materials.picture(rng, shape(0.8, 1.1), ppm), ppm) for _ in range(4)]
+        self._posters = [self._texture(materials.picture(rng, shape(0.8, 1.1), ppm), ppm) for _ in many(4)]
 
     def _is_free(self, low: Array, high: Array, *, among: bool = True) -> bool:
         gap = np.maximum(low - self._path, self._path - high)
@@ -125,35 +145,56 @@ class RoomBuilder:
 
     def furnish_walls(self, per_metre: float, *, deepest_m: float = 0.55) -> None:
         """Shelves, cabinets, cartons and crates along the four walls."""
-        rng = self._rng
         for axis in (0, 1):
-            length = self._high[axis] - self._low[axis]
-            for side in (0, 1):
-                for _ in range(int(length * per_metre * 2)):
-                    width = rng.uniform(0.4, 1.3)
-                    depth = rng.uniform(0.25, 1.0) * deepest_m
-                    kind = rng.integers(4)
-                    shortest, tallest = ((1.5, 2.1), (0.7, 1.2), (0.3, 0.7), (0.4, 1.6))[kind]
-                    height = rng.uniform(shortest, tallest)
-                    low, high = np.zeros(3), np.zeros(3)
-                    low[axis] = self._low[axis] + rng.uniform(0.0, max(length - width, 0.1))
-                    high[axis] = low[axis] + width
-                    other = 1 - axis
-                    low[other] = self._low[other] if side == 0 else self._high[other] - depth
-                    high[other] = low[other] + depth
-                    low[2], high[2] = self._low[2], self._low[2] + height
-                    wood = int(rng.choice(self._boards))
-                    front = (
-                        int(rng.choice(self._books)),
-                        int(rng.choice(self._fronts)),
-                        int(rng.choice(self._cartons)),
-                        int(rng.choice([*self._boards, self._cloth])),
-                    )[kind]
-                    flank = front if kind >= 2 else wood
-                    # Shelves and cabinets have their front towards the room, and plain wood at the flanks.
-                    sides = [front, front, flank, flank] if axis == 1 else [flank, flank, front, front]
-                    if self._try(low, high, sides, wood) and kind in (1, 3):
-                        self._stack(low, high)
+            for inward, limit in ((1, self._low), (-1, self._high)):
+                self.furnish_wall(
+                    axis,
+                    (self._low[axis], self._high[axis]),
+                    limit[1 - axis],
+                    inward,
+                    per_metre=per_metre,
+                    deepest_m=deepest_m,
+                )
+
+    def furnish_wall(
+        self, axis: int, span: tuple[float, float], at: float, inward: int, *, per_metre: float, deepest_m: float
+    ) -> None:
+        """Shelves, cabinets, cartons and crates along one wall.
+
+        Args:
+            axis: 0 or 1, that the wall runs along.
+            span: m, its ends on that axis.
+            at: m, where it stands on the other.
+            inward: 1 where the room lies on the side of larger coordinates, else -1.
+            per_metre: pieces on a metre, as far as there is room.
+            deepest_m: largest depth of a piece.
+        """
+        rng = self._rng
+        length, other = span[1] - span[0], 1 - axis
+        for _ in range(int(length * per_metre * 2)):
+            width = rng.uniform(0.4, 1.3)
+            depth = rng.uniform(0.25, 1.0) * deepest_m
+            kind = rng.integers(4)
+            shortest, tallest = ((1.5, 2.1), (0.7, 1.2), (0.3, 0.7), (0.4, 1.6))[kind]
+            height = rng.uniform(shortest, tallest)
+            low, high = np.zeros(3), np.zeros(3)
+            low[axis] = span[0] + rng.uniform(0.0, max(length - width, 0.1))
+            high[axis] = low[axis] + width
+            low[other] = at if inward > 0 else at - depth
+            high[other] = low[other] + depth
+            low[2], high[2] = self._low[2], self._low[2] + height
+            wood = int(rng.choice(self._boards))
+            front = (
+                int(rng.choice(self._books)),
+                int(rng.choice(self._fronts)),
+                int(rng.choice(self._cartons)),
+                int(rng.choice([*self._boards, self._cloth])),
+            )[kind]
+            flank = front if kind >= 2 else wood
+            # Shelves and cabinets have their front towards the room, and plain wood at the flanks.
+            sides = [front, front, flank, flank] if axis == 1 else [flank, flank, front, front]
+            if self._try(low, high, sides, wood) and kind in (1, 3):
+                self._stack(low, high)
 
     def _stack(self, low: Array, high: Array) -> None:
         """Something small on top of a piece."""

@@ -78,6 +78,30 @@ def test_a_corridor_is_long_and_comes_back() -> None:
     assert abs(position[-1, 0] - position[0, 0]) < 12.0
 
 
+def test_a_patrol_comes_back_to_where_it_began_and_goes_on_along_the_same_way() -> None:
+    for seed in range(3):
+        position = (
+            plan_motion("building", seed, 116.0, 2.0).motion.evaluate(np.arange(0.0, 115.0, 0.1)).T_world_body[:, :3, 3]
+        )
+        metres = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1))])
+        late, early = position[metres > 100.0], position[metres < 60.0]
+        apart = np.linalg.norm(late[:, None, :2] - early[None, :, :2], axis=2)
+        on_the_way_again = np.arange(len(late)) > apart[:, 0].argmin()
+        assert metres[-1] > 115.0
+        assert apart[:, 0].min() < 0.7
+        assert apart[on_the_way_again].min(axis=1).max() < 1.0
+        assert on_the_way_again.sum() * 0.1 * 1.2 > 10.0
+
+
+def test_a_building_is_planned_along_the_whole_lap_however_much_of_it_is_walked() -> None:
+    short, long = (plan_motion("building", 2, duration_s, 2.0).route for duration_s in (10.0, 116.0))
+    assert short is not None
+    assert long is not None
+    np.testing.assert_array_equal(short, long)
+    walked = plan_motion("building", 2, 116.0, 2.0).motion.evaluate(np.arange(0.0, 115.0, 0.5)).T_world_body[:, :3, 3]
+    assert np.linalg.norm(walked[:, None, :2] - long[None, :, :2], axis=2).min(axis=1).max() < 0.5
+
+
 @pytest.mark.parametrize("family", list(FAMILIES))
 def test_seeds_make_motions(family: str) -> None:
     times = np.arange(0.0, 10.0, 0.5)
