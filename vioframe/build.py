@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from vioframe.data.faults import Faults
+from vioframe.data.recording import Dataset
 from vioframe.errors import ConfigError, PluginError, TargetError, VioframeError
 from vioframe.pipeline import SLOTS, Pipeline
 from vioframe.plugins import discover
@@ -117,6 +119,20 @@ def resolve_class(target: object, key: str) -> type:
 
 def _lies_in(dotted: str, packages: tuple[str, ...]) -> bool:
     return any(dotted.startswith(f"{package}.") for package in packages)
+
+
+def build_dataset(config: DictConfig, choice: str = "") -> Dataset:
+    """Build the data set of ``config``, with the faults that are to be injected into its recordings.
+
+    Args:
+        config: with the nodes ``dataset`` and ``faults``.
+        choice: the option chosen in the group ``dataset``, for messages.
+
+    Raises:
+        ConfigError: either cannot be built.
+    """
+    dataset = build(config, "dataset", Dataset, choice)
+    return build(config, "faults", Faults).inject(dataset)
 
 
 def build_pipeline(config: DictConfig, choices: Mapping[str, str]) -> Pipeline:

@@ -60,6 +60,10 @@ class Recording(ABC):
         """What the checks found, good and bad, for ``task=doctor``."""
         return []
 
+    def faults(self) -> tuple[str, ...]:
+        """What was spoilt on purpose, such as ``("dropped_frames=0.1",)``; goes into the protocol of every number."""
+        return ()
+
     def counters(self) -> Mapping[str, int]:
         """What happened while streaming, such as ``{"corrupt images": 1}``; goes into the table."""
         return {}

@@ -64,6 +64,7 @@ class Protocol:
         truth_rate_hz: of the ground truth, or None.
         init: how the fuser was started; empty for a file.
         uses_ground_truth: parts that simulate a sensor from the truth.
+        faults: what was spoilt on purpose in the recording.
         nees_alignment: what was aligned before errors were weighed with their covariance.
     """
 
@@ -73,6 +74,7 @@ class Protocol:
     truth_rate_hz: float | None
     init: str
     uses_ground_truth: tuple[str, ...]
+    faults: tuple[str, ...]
     nees_alignment: str
 
     def as_dict(self) -> dict[str, object]:
@@ -80,6 +82,7 @@ class Protocol:
         document = asdict(self)
         del document["options"]
         document["uses_ground_truth"] = list(self.uses_ground_truth)
+        document["faults"] = list(self.faults)
         document["states"] = STATE_CHOICE
         return document
 
@@ -93,6 +96,8 @@ class Protocol:
             words.append(f"init={self.init}")
         if self.uses_ground_truth:
             words.append(f"simulated from the truth: {', '.join(self.uses_ground_truth)}")
+        if self.faults:
+            words.append(f"injected faults: {', '.join(self.faults)}")
         return " · ".join(words)
 
 

@@ -114,6 +114,7 @@ def make_protocol(run: SequenceRun, options: EvaluationOptions, output: Output, 
         truth_rate_hz=None if run.ground_truth is None else rate_hz(run.ground_truth.stamps_ns),
         init=run.init,
         uses_ground_truth=run.uses_ground_truth,
+        faults=run.faults,
         nees_alignment="none" if run.init == "groundtruth" else "yaw and position at the first tracking state",
     )
 

@@ -54,6 +54,7 @@ class SequenceRun:
         sample_frames: a few images for the report.
         init: how the fuser was started, ``"rest"`` or ``"groundtruth"``.
         uses_ground_truth: names of the parts that simulate a sensor from the truth.
+        faults: what was spoilt on purpose in the recording.
         error: what went wrong, in one sentence, or None.
         interrupted: the user stopped the run; ``error`` may say at which stamp.
     """
@@ -74,6 +75,7 @@ class SequenceRun:
     sample_frames: Sequence[SampleFrame] = ()
     init: str = "rest"
     uses_ground_truth: tuple[str, ...] = ()
+    faults: tuple[str, ...] = ()
     error: str | None = None
     interrupted: bool = False
 

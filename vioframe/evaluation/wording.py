@@ -185,6 +185,7 @@ def protocol_text(row: Mapping[str, object]) -> str:
     if isinstance(rate, int | float):
         words.append(f"{rate:.3g} Hz")
     used = protocol.get("uses_ground_truth")
+    faults = protocol.get("faults")
     for name, text in (
         ("alignment", "{} alignment"),
         ("init", "init={}"),
@@ -195,4 +196,6 @@ def protocol_text(row: Mapping[str, object]) -> str:
             words.append(text.format(protocol[name]))
     if isinstance(used, list) and used:
         words.append(f"simulated from the truth: {', '.join(map(str, used))}")
+    if isinstance(faults, list) and faults:
+        words.append(f"injected faults: {', '.join(map(str, faults))}")
     return " · ".join(words)

@@ -22,9 +22,9 @@ def run(config: "DictConfig") -> int:
     """Check the recordings of ``dataset=``; the status is 1 if anything is bad."""
     from rich.console import Console
 
-    from vioframe.build import build
+    from vioframe.build import build_dataset
 
-    dataset = build(config, "dataset", Dataset)
+    dataset = build_dataset(config)
     console = Console()
     diagnoses = []
     for name in dataset.sequences:

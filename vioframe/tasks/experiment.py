@@ -13,7 +13,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from vioframe import __version__
-from vioframe.build import build, build_pipeline
+from vioframe.build import build, build_dataset, build_pipeline
+from vioframe.data.faults import Faults
 from vioframe.data.recording import Dataset, Recording
 from vioframe.errors import VioframeError
 from vioframe.evaluation.protocol import EvaluationOptions
@@ -44,7 +45,7 @@ def run(config: DictConfig) -> int:
     choices = {group: str(option) for group, option in hydra_config.runtime.choices.items()}
     options = build_options(config)
     pipeline = build_pipeline(config, choices)
-    dataset = build(config, "dataset", Dataset, choices.get("dataset", ""))
+    dataset = build_dataset(config, choices.get("dataset", ""))
     tracker = build(config, "tracker", Tracker, choices.get("tracker", ""))
     viewer = build_viewer(config, choices)
     resolved = OmegaConf.to_yaml(config, resolve=True)
@@ -52,6 +53,7 @@ def run(config: DictConfig) -> int:
     (folder / "config.yaml").write_text(resolved, encoding="utf-8")
     tags = {slot: choices.get(slot, "none") for slot in (*pipeline.parts(), "dataset", "system")}
     plain = OmegaConf.to_container(config, resolve=True)
+    tags["faults"] = ", ".join(build(config, "faults", Faults).describe()) or "none"
     parameters = {str(key): value for key, value in plain.items()} if isinstance(plain, dict) else {}
     experiment = _Experiment(config, folder, options, pipeline, dataset, tracker, viewer, choices)
     with _terminate_like_interrupt(), tracker:

@@ -166,6 +166,7 @@ def run_sequence(
         sample_frames=recorder.samples,
         init=init,
         uses_ground_truth=users,
+        faults=recording.faults(),
         error=_say(stop, recorder.windows, expected),
         interrupted=isinstance(stop, KeyboardInterrupt),
     )

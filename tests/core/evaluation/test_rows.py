@@ -139,6 +139,7 @@ def test_a_whole_run_lacks_nothing() -> None:
         "truth_rate_hz": pytest.approx(20.0),
         "init": "rest",
         "uses_ground_truth": [],
+        "faults": [],
         "nees_alignment": "yaw and position at the first tracking state",
         "states": "tracking and lost",
     }
