@@ -12,7 +12,7 @@ from vioframe.consistency import StandstillTest
 from vioframe.error_state import Body
 from vioframe.errors import ConfigError, ShapeError, StateError
 from vioframe.fusion_options import StandstillOptions
-from vioframe.interfaces import INERTIAL_DELTA, TRACKS, Fuser
+from vioframe.interfaces import INERTIAL_DELTA, STEREO_TRACKS, TRACKS, Fuser
 from vioframe.tight.failure import FailureMonitor
 from vioframe.tight.options import CalibrationOptions, FailureOptions, InertialTrust
 from vioframe.tight.restart import DeadReckoning, coast_across
@@ -39,6 +39,7 @@ class TightFuser(Fuser):
     window moves it on, and in :meth:`_estimate` what it believes.
 
     Args:
+        stereo: True needs the points in camera 1 too, False leaves them out, None takes what the front end gives.
         inertial: trust in the inertial increments.
         calibration: what of the calibration is estimated.
         standstill: measuring no motion at rest.
@@ -51,12 +52,17 @@ class TightFuser(Fuser):
     def __init__(
         self,
         *,
+        stereo: bool | None = None,
         inertial: InertialTrust | None = None,
         calibration: CalibrationOptions | None = None,
         standstill: StandstillOptions | None = None,
         start: TightStartOptions | None = None,
         failure: FailureOptions | None = None,
     ) -> None:
+        if stereo:
+            # What it needs depends on its options, so the instance says it, not the class.
+            self.requires = self.requires | {STEREO_TRACKS}  # type: ignore[misc]
+        self._uses_stereo = stereo is not False
         self._inertial = inertial or InertialTrust()
         self._calibration = calibration or CalibrationOptions()
         self._standstill = standstill or StandstillOptions()
@@ -201,7 +207,7 @@ class TightFuser(Fuser):
             window=measurement.window,
             delta=self._inertial.trusted(delta, measurement.window.gap_ns),
             tracks=Tracks.none() if features is None or features.tracks is None else features.tracks,
-            stereo=None if features is None else features.stereo,
+            stereo=features.stereo if features is not None and self._uses_stereo else None,
             at_rest=at_rest,
         )
 

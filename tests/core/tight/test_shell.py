@@ -11,6 +11,7 @@ from vioframe.error_state import InertialFilter
 from vioframe.errors import ConfigError, StateError
 from vioframe.fusion_options import StandstillOptions
 from vioframe.geometry import se3, so3
+from vioframe.interfaces import STEREO_TRACKS
 from vioframe.tight.failure import FailureMonitor
 from vioframe.tight.fuser import TightFuser
 from vioframe.tight.options import CalibrationOptions, FailureOptions, InertialTrust
@@ -316,3 +317,23 @@ def test_memory_of_the_monitor_is_bounded(walk):
 def test_options_outside_their_range_are_refused(make):
     with pytest.raises(ConfigError, match=r"fuser\."):
         make()
+
+
+def test_stereo_points_are_needed_taken_or_left_out_as_asked(walk):
+    class Looker(Reckoner):
+        def _advance(self, step: Step) -> Support:
+            self.seen = step.stereo
+            return super()._advance(step)
+
+    pair = replace(some_tracks(), camera=1)
+
+    def change(index, measurement):
+        frame = measurement.window.current
+        return replace(measurement, features=VisualFeatures(frame=frame, tracks=some_tracks(), stereo=pair))
+
+    for stereo, needed, taken in ((True, True, True), (False, False, False), (None, False, True)):
+        fuser = Looker(stereo=stereo)
+        assert (STEREO_TRACKS in fuser.requires) is needed
+        run(fuser, walk, change)
+        assert (fuser.seen is pair) is taken
+    assert STEREO_TRACKS not in Looker.requires
