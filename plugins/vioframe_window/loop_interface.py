@@ -26,7 +26,7 @@ from vioframe.types import Image, SensorRig, Tracks, Trajectory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Keyframe:
+class LoopKeyframe:
     """One keyframe of the smoother, as it is estimated now.
 
     Attributes:
@@ -84,7 +84,7 @@ class LoopCloser(ABC):
         """
 
     @abstractmethod
-    def add_keyframe(self, keyframe: Keyframe) -> LoopMatch | None:
+    def add_keyframe(self, keyframe: LoopKeyframe) -> LoopMatch | None:
         """Take the next keyframe; a match, if it sees a known place, is already part of the correction."""
 
     @abstractmethod
