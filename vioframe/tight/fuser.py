@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from vioframe.checks import Array
 from vioframe.consistency import StandstillTest
 from vioframe.error_state import Body
 from vioframe.errors import ConfigError, ShapeError, StateError
@@ -102,6 +103,10 @@ class TightFuser(Fuser):
         if self._running:
             return self._estimate().bias
         return ImuBias() if self._past is None else self._past.bias
+
+    def T_body_cam(self) -> Array:
+        """Place of camera 0 on the body, (4, 4), as estimated now; as calibrated where it is not."""
+        return self._rig.cameras[0].T_body_cam
 
     def counters(self) -> Mapping[str, int]:
         """Restarts, windows with holes, missing windows, standstill measurements, and what the method counts."""
