@@ -1,0 +1,237 @@
+"""Fixed-lag smoothing of inertial samples and points, with a causal state at every image."""
+
+import numpy as np
+
+from vioframe.checks import Array, Mask, Stamps
+from vioframe.conventions import NANOSECONDS, seconds
+from vioframe.error_state import InertialFilter
+from vioframe.fusion_options import StandstillOptions
+from vioframe.geometry import se3, so3
+from vioframe.tight.fuser import TightFuser
+from vioframe.tight.options import CalibrationOptions, FailureOptions, InertialTrust
+from vioframe.tight.start import TightStartOptions
+from vioframe.tight.step import Start, Step, Support
+from vioframe.types import NavState, SensorRig, Trajectory
+from vioframe_window.keyframes import Keyframe, View, focal_length
+from vioframe_window.library import require_gtsam
+from vioframe_window.options import LandmarkOptions, WindowOptions
+from vioframe_window.triangulation import NewPoints, find_new_points, reprojection_errors
+
+# With fewer points than this in view, what may enter is judged by a wider gate.
+_FEW = 20
+_SLACK = 3.0
+# A point of the window may be this much further off, in a predicted view, than a new one in the views it has.
+_TRACKED = 2.0
+
+
+class WindowFuser(TightFuser):
+    """Keyframes at a few hertz in a fixed-lag smoother; between them the inertial samples.
+
+    Args:
+        window: keyframes and solver.
+        landmarks: points and their observations.
+        inertial: trust in the inertial increments.
+        calibration: what of the calibration is estimated.
+        standstill: measuring no motion at rest.
+        start: how it begins.
+        failure: when it is not believed any more.
+
+    Raises:
+        PluginError: gtsam is not installed.
+    """
+
+    def __init__(
+        self,
+        *,
+        window: WindowOptions | None = None,
+        landmarks: LandmarkOptions | None = None,
+        inertial: InertialTrust | None = None,
+        calibration: CalibrationOptions | None = None,
+        standstill: StandstillOptions | None = None,
+        start: TightStartOptions | None = None,
+        failure: FailureOptions | None = None,
+    ) -> None:
+        super().__init__(
+            inertial=inertial, calibration=calibration, standstill=standstill, start=start, failure=failure
+        )
+        require_gtsam()
+        self._window = window or WindowOptions()
+        self._landmarks = landmarks or LandmarkOptions()
+
+    def setup(self, rig: SensorRig) -> None:
+        """Forget the last sequence and take the next one's calibration."""
+        from vioframe_window.samples import SampleIntegrator
+        from vioframe_window.smoother import Smoother
+
+        super().setup(rig)
+        self._focal_px = focal_length(rig.cameras[0])
+        self._samples = SampleIntegrator(self._noise, rig.gravity, self._inertial)
+        self._smoother = Smoother(rig.cameras[:2], self._window, self._landmarks, self._standstill)
+        self._filter = InertialFilter(extra=0, noise=self._noise, gravity=rig.gravity)
+        self._settled: dict[int, Array] = {}
+
+    def camera_delay_ns(self) -> int | None:
+        """The estimated delay of the camera, where it is estimated."""
+        if not (self._calibration.time_offset and self._ready and self._running):
+            return None
+        return round(self._smoother.delay_s * NANOSECONDS)
+
+    def smoothed(self) -> Trajectory | None:
+        """Keyframes as they were when they left the window."""
+        if not self._ready or not self._settled:
+            return None
+        if self._running:
+            self._settle()
+        stamps_ns = np.array(sorted(self._settled), dtype=np.int64)
+        return Trajectory(
+            stamps_ns=stamps_ns, T_world_body=np.array([self._settled[s] for s in stamps_ns.tolist()]), causal=False
+        )
+
+    def _begin(self, start: Start) -> None:
+        from vioframe_window.smoother import Calibration
+
+        options = self._calibration
+        camera = self._rig.cameras[0]
+        found = start.T_body_cam is not None
+        rotation_sigma, position_sigma = options.rotation_sigma, options.position_sigma
+        if not options.estimates_extrinsics:
+            rotation_sigma = position_sigma = 0.0
+        elif found:
+            rotation_sigma = max(start.rotation_sigma, 1e-3)
+        delay_s = seconds(self._rig.camera_delay_ns)
+        state = start.state
+        covariance = 1e-6 * np.eye(15) if state.covariance is None else state.covariance
+        first = Keyframe(
+            index=0,
+            stamp_ns=state.stamp_ns,
+            views=(),
+            increment=None,
+            at_rest=False,
+            delay_s=delay_s,
+            rate=state.bias.gyro,
+            T_world_body=state.T_world_body,
+            v_world_body=state.v_world_body,
+            bias=state.bias,
+        )
+        calibration = Calibration(
+            T_body_cam=camera.T_body_cam if start.T_body_cam is None else start.T_body_cam,
+            sigmas=np.repeat([rotation_sigma, position_sigma], 3),
+            delay_s=delay_s,
+            delay_sigma=options.time_offset_sigma_s if options.time_offset else None,
+            is_estimated=options.estimates_extrinsics or options.time_offset,
+        )
+        first.T_world_cam = first.T_world_body @ calibration.T_body_cam
+        self._smoother.begin(first, state, covariance, calibration)
+        self._continue()
+
+    def _advance(self, step: Step) -> Support:
+        self._samples.push(step.window)
+        self._filter.propagate(step.delta)
+        self._now_ns = step.stamp_ns
+        self._rested = self._rested and step.at_rest
+        views = (View.of(step.tracks), View.of(step.stereo))[: len(self._rig.cameras)]
+        if self._is_keyframe(views[0]):
+            return self._add_keyframe(step, views)
+        known, agrees = self._known(views[0], self._camera_poses()[0])
+        return Support(used=int(agrees.sum()), points=len(self._smoother.point_ids), at_rest=step.at_rest)
+
+    def _estimate(self) -> NavState:
+        return self._filter.nav_state(self._now_ns, "tracking")
+
+    def _continue(self) -> None:
+        """Go on from the newest keyframe."""
+        newest = self._smoother.newest
+        self._now_ns = newest.stamp_ns
+        self._rested = True
+        self._filter.start(
+            NavState(
+                stamp_ns=newest.stamp_ns,
+                T_world_body=se3.from_parts(so3.normalise(newest.T_world_body[:3, :3]), newest.T_world_body[:3, 3]),
+                v_world_body=newest.v_world_body,
+                bias=newest.bias,
+            ),
+            self._smoother.covariance,
+        )
+        self._samples.begin(newest.bias)
+
+    def _is_keyframe(self, view: View) -> bool:
+        newest = self._smoother.newest
+        # Half an image early is as near to the wanted time as half an image late.
+        elapsed_s = seconds(self._now_ns - newest.stamp_ns)
+        if elapsed_s > self._window.keyframe_s - 0.01:
+            return True
+        if not newest.views or not len(newest.views[0].ids):
+            return False
+        _, kept = view.find(newest.views[0].ids)
+        return bool(kept.mean() < self._window.sparse_below)
+
+    def _camera_poses(self) -> Array:
+        """Cameras (C, 4, 4) in the world where the body is now."""
+        return self._smoother.camera_poses(self._filter.body.T_world_body @ self._smoother.T_body_cam)
+
+    def _known(self, view: View, T_world_cam: Array) -> tuple[Stamps, Mask]:
+        """Rows (N,) of a view that show points of the window, and which (N,) of them agree with their points."""
+        ids, points_world = self._smoother.point_ids, self._smoother.points_world
+        rows, seen = view.find(ids)
+        rows, points_world = rows[seen], points_world[seen]
+        errors = reprojection_errors(T_world_cam[None], points_world, view.bearings[None, rows])[0]
+        depths = (points_world - T_world_cam[:3, 3]) @ T_world_cam[:3, 2]
+        limit = (_SLACK if len(rows) < _FEW else 1.0) * _TRACKED * self._landmarks.max_error_px / self._focal_px
+        return rows, (errors < limit) & (depths > self._landmarks.min_depth)
+
+    def _add_keyframe(self, step: Step, views: tuple[View, ...]) -> Support:
+        smoother, body = self._smoother, self._filter.body
+        keyframe = Keyframe(
+            index=smoother.newest.index + 1,
+            stamp_ns=step.stamp_ns,
+            views=views,
+            increment=self._samples.take(),
+            at_rest=self._rested,
+            delay_s=seconds(step.window.camera_delay_ns),
+            rate=step.window.imu.gyro[-1],
+            T_world_body=body.T_world_body,
+            v_world_body=body.v,
+            bias=body.bias,
+        )
+        smoother.predict(keyframe)
+        observed, refused = {}, 0
+        for camera, (view, T_world_cam) in enumerate(
+            zip(views, smoother.camera_poses(keyframe.T_world_cam), strict=False)
+        ):
+            rows, agrees = self._known(view, T_world_cam)
+            observed[camera] = rows[agrees]
+            refused += int((~agrees).sum())
+        held = len(observed[0])
+        new = self._find_new(keyframe, held)
+        self._settle()
+        if not smoother.add(keyframe, observed, new.ids, new.points_world):
+            self._count("windows solved again")
+        self._continue()
+        return Support(
+            used=sum(len(rows) for rows in observed.values()) + len(new.ids),
+            refused=refused + new.refused,
+            points=len(smoother.point_ids),
+            at_rest=step.at_rest,
+        )
+
+    def _find_new(self, keyframe: Keyframe, held: int) -> NewPoints:
+        """Points of the newest keyframe to take in, in front of all cameras that saw them."""
+        smoother = self._smoother
+        keyframes = [*smoother.keyframes, keyframe]
+        T_world_cam = np.concatenate([smoother.camera_poses(k.T_world_cam)[: len(k.views)] for k in keyframes])
+        ids = keyframe.views[0].ids
+        ids = ids[~np.isin(ids, smoother.point_ids)]
+        return find_new_points(
+            T_world_cam,
+            [view for k in keyframes for view in k.views],
+            ids,
+            self._landmarks,
+            most=min(self._landmarks.most - held, self._landmarks.most_new),
+            focal_px=self._focal_px,
+            slack=_SLACK if held < _FEW else 1.0,
+        )
+
+    def _settle(self) -> None:
+        """Keep the estimates of the window's keyframes, which are better the older they are."""
+        for keyframe in self._smoother.keyframes:
+            self._settled[keyframe.stamp_ns] = keyframe.T_world_body

@@ -1,0 +1,18 @@
+"""The door to gtsam, which is an extra: everything else in this plugin that needs it is imported behind it."""
+
+from importlib.util import find_spec
+
+from vioframe.errors import PluginError
+
+
+def require_gtsam() -> None:
+    """Say what to do where gtsam is not installed.
+
+    Raises:
+        PluginError: it is not.
+    """
+    if find_spec("gtsam") is None:
+        raise PluginError(
+            "fuser=window solves its window with gtsam, which is not installed: pip install 'vioframe[window]', "
+            "or choose fuser=msckf, which needs nothing more"
+        )
