@@ -238,8 +238,8 @@ class StartOptions:
             accel_bias_sigma=self.accel_bias_sigma,
         )
 
-    def at_rest(self, rig: SensorRig) -> RestInitialiser:
-        """What waits for a standstill in a sequence."""
+    def at_rest(self, rig: SensorRig, *, complain: bool = True) -> RestInitialiser:
+        """What waits for a standstill in a sequence; it says in the log that none comes if it is to ``complain``."""
         return RestInitialiser(
             rig,
             duration_s=self.rest_duration_s,
@@ -247,6 +247,7 @@ class StartOptions:
             accel_threshold=self.rest_accel,
             accel_bias_sigma=self.rest_accel_bias_sigma,
             max_flow_deg=self.rest_flow_deg,
+            complain=complain,
         )
 
     def covariance_of(self, state: NavState) -> Array:

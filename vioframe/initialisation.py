@@ -184,6 +184,7 @@ class RestInitialiser:
         max_flow_deg: largest median angle by which image points move during the standstill, degrees. Idling
             motors shake EuRoC's V1_01 by 0.1; a car's images move by 0.5 and more from one frame to the next.
         patience_s: seconds without a standstill after which the log says, once, what is missing.
+        complain: whether the log says it at all.
     """
 
     def __init__(
@@ -197,6 +198,7 @@ class RestInitialiser:
         gravity_sigma: float = 0.01,
         max_flow_deg: float = 0.25,
         patience_s: float = 3.0,
+        complain: bool = True,
     ) -> None:
         for name, value in (("accel_bias_sigma", accel_bias_sigma), ("gravity_sigma", gravity_sigma)):
             if not value >= 0.0:
@@ -214,8 +216,7 @@ class RestInitialiser:
         self._images = ImageMotion(duration_s)
         self._patience_s = patience_s
         self._first_ns: int | None = None
-        self._complained = False
-        self._contradicted = False
+        self._complained = self._contradicted = not complain
 
     def push(self, window: SyncedWindow, features: VisualFeatures | None = None) -> NavState | None:
         """Take the next window; return the state at ``window.current``, or None as long as the body moves.
