@@ -1,19 +1,23 @@
 """Fixed-lag smoothing of inertial samples and points, with a causal state at every image."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from vioframe.checks import Array, Mask, Stamps
 from vioframe.conventions import NANOSECONDS, seconds
 from vioframe.error_state import InertialFilter
+from vioframe.errors import ConfigError
 from vioframe.fusion_options import StandstillOptions
 from vioframe.geometry import se3, so3
 from vioframe.tight.fuser import TightFuser
 from vioframe.tight.options import CalibrationOptions, FailureOptions, InertialTrust
 from vioframe.tight.start import TightStartOptions
 from vioframe.tight.step import Start, Step, Support
-from vioframe.types import NavState, SensorRig, Trajectory
+from vioframe.types import Measurement, NavState, SensorRig, Trajectory
 from vioframe_window.keyframes import Keyframe, View, focal_length
 from vioframe_window.library import require_gtsam
+from vioframe_window.loop_interface import LoopCloser
 from vioframe_window.options import LandmarkOptions, WindowOptions
 from vioframe_window.triangulation import NewPoints, find_new_points, reprojection_errors
 
@@ -35,8 +39,13 @@ class WindowFuser(TightFuser):
         standstill: measuring no motion at rest.
         start: how it begins.
         failure: when it is not believed any more.
+        stereo: True needs the points in camera 1 too, False leaves them out, None takes what the front end gives.
+        loop: recognises places; None, or the empty choice ``loop=none``, for no loop closure.
+        loop_corrects_states: give causal states in the map that the loop closer keeps; else in the odometry frame,
+            which drifts and does not jump.
 
     Raises:
+        ConfigError: ``loop`` is something else.
         PluginError: gtsam is not installed.
     """
 
@@ -50,16 +59,29 @@ class WindowFuser(TightFuser):
         standstill: StandstillOptions | None = None,
         start: TightStartOptions | None = None,
         failure: FailureOptions | None = None,
+        stereo: bool | None = None,
+        loop: LoopCloser | None = None,
+        loop_corrects_states: bool = True,
     ) -> None:
         super().__init__(
-            inertial=inertial, calibration=calibration, standstill=standstill, start=start, failure=failure
+            stereo=stereo,
+            inertial=inertial,
+            calibration=calibration,
+            standstill=standstill,
+            start=start,
+            failure=failure,
         )
         require_gtsam()
         self._window = window or WindowOptions()
         self._landmarks = landmarks or LandmarkOptions()
+        if loop and not isinstance(loop, LoopCloser):
+            raise ConfigError(f"fuser.loop must be a loop closer, such as loop=bow, or none; got {loop!r}")
+        self._loop = loop or None
+        self._loop_corrects_states = loop_corrects_states
 
     def setup(self, rig: SensorRig) -> None:
         """Forget the last sequence and take the next one's calibration."""
+        from vioframe_window.relocalisation import Relocalisation
         from vioframe_window.samples import SampleIntegrator
         from vioframe_window.smoother import Smoother
 
@@ -69,6 +91,36 @@ class WindowFuser(TightFuser):
         self._smoother = Smoother(rig.cameras[:2], self._window, self._landmarks, self._standstill)
         self._filter = InertialFilter(extra=0, noise=self._noise, gravity=rig.gravity)
         self._settled: dict[int, Array] = {}
+        self._now_ns = 0
+        self._rested = True
+        self._relocalisation = None
+        if self._loop is not None:
+            self._loop.setup(rig)
+            self._relocalisation = Relocalisation(self._loop, self._smoother)
+
+    def counters(self) -> Mapping[str, int]:
+        """What the shell and the loop closer count, and windows that had to be built again."""
+        counts = dict(super().counters())
+        return counts if self._loop is None else counts | dict(self._loop.counters())
+
+    def update(self, measurement: Measurement) -> list[NavState]:
+        """Move on by one window; see :meth:`vioframe.tight.fuser.TightFuser.update`."""
+        states = super().update(measurement)
+        if self._loop is None or not self._loop_corrects_states:
+            return states
+        from vioframe_window.relocalisation import in_map
+
+        return [in_map(state, self._loop.T_map_world) for state in states]
+
+    def flush(self) -> list[NavState]:
+        """The recording has ended; there is no state that was not given."""
+        if self._loop is not None and self._ready:
+            self._loop.finish()
+        return super().flush()
+
+    def T_body_cam(self) -> Array:
+        """Place of camera 0 on the body, (4, 4), as estimated now."""
+        return self._smoother.T_body_cam if self._running else super().T_body_cam()
 
     def camera_delay_ns(self) -> int | None:
         """The estimated delay of the camera, where it is estimated."""
@@ -77,15 +129,15 @@ class WindowFuser(TightFuser):
         return round(self._smoother.delay_s * NANOSECONDS)
 
     def smoothed(self) -> Trajectory | None:
-        """Keyframes as they were when they left the window."""
+        """Keyframes as they were when they left the window; with loop closure, as its pose graph has them."""
         if not self._ready or not self._settled:
             return None
         if self._running:
             self._settle()
         stamps_ns = np.array(sorted(self._settled), dtype=np.int64)
-        return Trajectory(
-            stamps_ns=stamps_ns, T_world_body=np.array([self._settled[s] for s in stamps_ns.tolist()]), causal=False
-        )
+        poses = np.array([self._settled[stamp_ns] for stamp_ns in stamps_ns.tolist()])
+        trajectory = Trajectory(stamps_ns=stamps_ns, T_world_body=poses, causal=False)
+        return trajectory if self._loop is None else self._loop.correct(trajectory)
 
     def _begin(self, start: Start) -> None:
         from vioframe_window.smoother import Calibration
@@ -121,6 +173,8 @@ class WindowFuser(TightFuser):
             is_estimated=options.estimates_extrinsics or options.time_offset,
         )
         first.T_world_cam = first.T_world_body @ calibration.T_body_cam
+        if self._relocalisation is not None and self._settled:
+            self._relocalisation.interrupt()
         self._smoother.begin(first, state, covariance, calibration)
         self._continue()
 
@@ -129,10 +183,10 @@ class WindowFuser(TightFuser):
         self._filter.propagate(step.delta)
         self._now_ns = step.stamp_ns
         self._rested = self._rested and step.at_rest
-        views = (View.of(step.tracks), View.of(step.stereo))[: len(self._rig.cameras)]
+        views = (View.of(step.tracks), *([] if step.stereo is None else [View.of(step.stereo)]))
         if self._is_keyframe(views[0]):
             return self._add_keyframe(step, views)
-        known, agrees = self._known(views[0], self._camera_poses()[0])
+        agrees = self._known(views[0], self._camera_poses()[0])[1]
         return Support(used=int(agrees.sum()), points=len(self._smoother.point_ids), at_rest=step.at_rest)
 
     def _estimate(self) -> NavState:
@@ -207,6 +261,8 @@ class WindowFuser(TightFuser):
         if not smoother.add(keyframe, observed, new.ids, new.points_world):
             self._count("windows solved again")
         self._continue()
+        if self._relocalisation is not None and step.window.current.images:
+            self._relocalisation.take_keyframe(step.window.current.images[0], step.tracks)
         return Support(
             used=sum(len(rows) for rows in observed.values()) + len(new.ids),
             refused=refused + new.refused,
@@ -226,7 +282,7 @@ class WindowFuser(TightFuser):
             [view for k in keyframes for view in k.views],
             ids,
             self._landmarks,
-            most=min(self._landmarks.most - held, self._landmarks.most_new),
+            most=min(self._landmarks.most - len(smoother.point_ids), self._landmarks.most_new),
             focal_px=self._focal_px,
             slack=_SLACK if held < _FEW else 1.0,
         )

@@ -1,11 +1,15 @@
 """Keyframes and what they saw, in arrays sorted by point."""
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vioframe.checks import Array, Mask, Stamps
 from vioframe.types import Camera, ImuBias, Tracks
+
+if TYPE_CHECKING:
+    import gtsam
 
 # Past about 78° off the axis the image plane at depth 1 stretches an error of one pixel over the whole image.
 _MIN_COSINE = 0.2
@@ -61,7 +65,7 @@ class Keyframe:
     index: int
     stamp_ns: int
     views: tuple[View, ...]
-    increment: object | None
+    increment: "gtsam.PreintegratedCombinedMeasurements | None"
     at_rest: bool
     delay_s: float
     rate: Array

@@ -55,7 +55,7 @@ class SampleIntegrator:
         self._params.setBiasAccCovariance(max(noise.accel_walk, 1e-9) ** 2 * np.eye(3))
         self._params.setBiasOmegaCovariance(max(noise.gyro_walk, 1e-9) ** 2 * np.eye(3))
         self._set_white_noise(noise.gyro_noise, noise.accel_noise)
-        self._collected: gtsam.PreintegratedCombinedMeasurements | None = None
+        self.begin(ImuBias())
 
     def begin(self, bias: ImuBias) -> None:
         """Forget the samples; those to come are linearised at ``bias``."""
@@ -69,13 +69,13 @@ class SampleIntegrator:
         rates, forces, steps = midpoint_steps(window, self._bias)
         collected = self._collected
         in_hole = np.zeros(len(steps), dtype=bool)
+        gap_s = seconds(window.gap_ns)
         if self._trust.has_gap(window.gap_ns):
             in_hole = steps > _HOLE_STEPS / self._noise.rate_hz
-            gap_s = seconds(window.gap_ns)
         for rate, force, step, hole in zip(rates, forces, steps.tolist(), in_hole.tolist(), strict=True):
             if hole:
                 # An unknown constant over the hole: as white noise, as strong as what it adds up to at its end.
-                root = np.sqrt(min(gap_s, step) if gap_s > step else gap_s)
+                root = np.sqrt(gap_s)
                 self._set_white_noise(self._trust.gap_rate_sigma * root, self._trust.gap_accel_sigma * root)
             collected.integrateMeasurement(force, rate, step)
             if hole:

@@ -7,8 +7,10 @@ written in Python, and the many projections stay gtsam's own. Variables older th
 (:class:`gtsam.IncrementalFixedLagSmoother`: Kaess et al., "iSAM2", IJRR 2012).
 """
 
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import SupportsFloat, SupportsIndex, SupportsInt
 
 import gtsam
 import numpy as np
@@ -23,8 +25,12 @@ from vioframe_window.keyframes import Keyframe, focal_length
 from vioframe_window.options import LandmarkOptions, WindowOptions
 from vioframe_window.triangulation import gather, reprojection_errors
 
+log = logging.getLogger(__name__)
+
 # Observations are normalised coordinates, so that any lens is a pinhole of focal length 1.
 _CALIBRATION = gtsam.Cal3_S2()
+# Fewer points do not say where an old image was taken.
+_FEWEST_SEEN_AGAIN = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -108,6 +114,8 @@ class Smoother:
         self.point_ids: Stamps = np.zeros(0, dtype=np.int64)
         self.points_world: Array = np.zeros((0, 3))
         self._point_stamps_ns: Stamps = np.zeros(0, dtype=np.int64)
+        self.loop_cameras: dict[int, Array] = {}
+        self._waiting = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self.covariance = covariance
         self._origin_ns = keyframe.stamp_ns
         self._open(state, covariance)
@@ -126,7 +134,8 @@ class Smoother:
         Returns:
             False where the system could not be solved and was built again from the last estimates.
         """
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        graph, values = self._waiting
+        self._waiting = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._add_motion(graph, values, keyframe, self.newest)
         self.keyframes.append(keyframe)
         for camera, rows in observed.items():
@@ -143,13 +152,40 @@ class Smoother:
         try:
             self._solve(graph, values, self.point_ids[seen])
         except RuntimeError:
-            self._rebuild()
+            self._rebuild_or_fail()
             return False
+        return True
+
+    def see_again(self, match_id: int, T_world_cam: Array, ids: Stamps, points: Array) -> bool:
+        """Take in, with the next keyframe, an old image that shows points of the window.
+
+        Args:
+            match_id: names it in :attr:`loop_cameras`.
+            T_world_cam: (4, 4) guess of where camera 0 was.
+            ids: (N,) points it shows.
+            points: (N, 2) where, in normalised coordinates.
+
+        Returns:
+            False where too few of them are still in the window.
+        """
+        held = np.flatnonzero(np.isin(ids, self.point_ids))
+        if len(held) < _FEWEST_SEEN_AGAIN:
+            return False
+        graph, values = self._waiting
+        values.insert(factors.loop_key(match_id), gtsam.Pose3(T_world_cam))
+        for row in held.tolist():
+            key = factors.point_key(int(ids[row]))
+            graph.push_back(
+                gtsam.GenericProjectionFactorCal3_S2(
+                    points[row], self._pixel, factors.loop_key(match_id), key, _CALIBRATION
+                )
+            )
+        self.loop_cameras[match_id] = T_world_cam
         return True
 
     def _solve(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, seen: Stamps) -> None:
         now = self._time(self.newest.stamp_ns)
-        stamps = dict.fromkeys(values.keys(), now)
+        stamps: dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex] = dict.fromkeys(values.keys(), now)
         stamps.update(dict.fromkeys([factors.point_key(track_id) for track_id in seen.tolist()], now))
         if self._calibration.is_estimated:
             stamps[factors.EXTRINSICS] = now
@@ -185,6 +221,11 @@ class Smoother:
         points = [values.atPoint3(key) for key, lives in zip(keys, alive.tolist(), strict=True) if lives]
         self.point_ids, self._point_stamps_ns = self.point_ids[alive], self._point_stamps_ns[alive]
         self.points_world = np.array(points).reshape(-1, 3)
+        self.loop_cameras = {
+            match_id: values.atPose3(factors.loop_key(match_id)).matrix()
+            for match_id in self.loop_cameras
+            if values.exists(factors.loop_key(match_id))
+        }
         self.covariance = self._marginal()
 
     def _marginal(self) -> Array:
@@ -228,8 +269,25 @@ class Smoother:
             self._tie(graph, first)
         self._solver.update(graph, values, dict.fromkeys(values.keys(), self._time(first.stamp_ns)))
 
-    def _rebuild(self) -> None:
-        """Start over from the last estimates, with every factor that is still sound."""
+    def _rebuild_or_fail(self) -> None:
+        """Start over from the last estimates, without points if need be.
+
+        Raises:
+            LinAlgError: even the inertial samples alone have no solution.
+        """
+        self._waiting = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self.loop_cameras.clear()
+        for sound in (self._sound_points(), np.zeros(0, dtype=np.int64)):
+            try:
+                self._rebuild(sound)
+            except RuntimeError as error:
+                log.debug("the window could not be built again with %d points: %s", len(sound), error)
+            else:
+                return
+        raise np.linalg.LinAlgError("the window of the smoother has no solution")
+
+    def _rebuild(self, sound: Stamps) -> None:
+        """Start over from the last estimates, with the points in rows ``sound``."""
         oldest = self.keyframes[0]
         state = NavState(
             stamp_ns=oldest.stamp_ns,
@@ -238,11 +296,10 @@ class Smoother:
             bias=oldest.bias,
         )
         self._open(state, self.covariance)
-        sound = self._sound_points()
         self.point_ids, self._point_stamps_ns = self.point_ids[sound], self._point_stamps_ns[sound]
         self.points_world = self.points_world[sound]
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        stamps = {}
+        stamps: dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex] = {}
         for before, keyframe in zip(self.keyframes[:-1], self.keyframes[1:], strict=True):
             known = set(values.keys())
             self._add_motion(graph, values, keyframe, before)
@@ -257,7 +314,7 @@ class Smoother:
         self._solver.update(graph, values, stamps)
         self._solve(gtsam.NonlinearFactorGraph(), gtsam.Values(), self.point_ids[:0])
 
-    def _sound_points(self) -> Array:
+    def _sound_points(self) -> Stamps:
         """Rows of the points that at least two views see in front of them and near where they project."""
         T_world_cam = np.concatenate([self.camera_poses(k.T_world_cam)[: len(k.views)] for k in self.keyframes])
         bearings, seen = gather([view for k in self.keyframes for view in k.views], self.point_ids)
@@ -271,17 +328,19 @@ class Smoother:
     ) -> None:
         self._insert(values, keyframe)
         i, j = before.index, keyframe.index
-        graph.push_back(
-            gtsam.CombinedImuFactor(
-                factors.body_key(i),
-                factors.velocity_key(i),
-                factors.body_key(j),
-                factors.velocity_key(j),
-                factors.bias_key(i),
-                factors.bias_key(j),
-                keyframe.increment,
+        if keyframe.increment is not None:
+            poses, velocities = ([key(i), key(j)] for key in (factors.body_key, factors.velocity_key))
+            graph.push_back(
+                gtsam.CombinedImuFactor(
+                    poses[0],
+                    velocities[0],
+                    poses[1],
+                    velocities[1],
+                    factors.bias_key(i),
+                    factors.bias_key(j),
+                    keyframe.increment,
+                )
             )
-        )
         if keyframe.at_rest:
             graph.push_back(
                 gtsam.BetweenFactorPose3(factors.body_key(i), factors.body_key(j), gtsam.Pose3(), self._no_motion)

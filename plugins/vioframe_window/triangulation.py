@@ -69,7 +69,7 @@ def find_new_points(
         return NewPoints(ids=ids[:0], points_world=np.zeros((0, 3)), refused=0)
     points, depths = triangulate(T_world_cam, bearings, seen.astype(float))
     in_range = (depths > options.min_depth) & (depths < options.max_depth)
-    good = np.isfinite(points).all(axis=1) & (in_range | ~seen).all(axis=0)
+    good = np.isfinite(points).all(axis=1) & np.all(in_range | ~seen, axis=0)
     errors = reprojection_errors(T_world_cam, np.where(good[:, None], points, 0.0), bearings)
     worst = np.where(seen, errors, 0.0).max(axis=0) * focal_px
     good &= worst < slack * options.max_error_px
