@@ -18,6 +18,7 @@ from vioframe_window.loop_geometry import Found, locate
 from vioframe_window.loop_interface import LoopCloser, LoopKeyframe, LoopMatch
 from vioframe_window.loop_map import PlaceMap, load_map, save_map
 from vioframe_window.loop_options import GraphOptions, Retrieval, Verification
+from vioframe_window.loop_points import RecentPoints
 from vioframe_window.loop_trajectory import KeyframeTrajectory
 from vioframe_window.loop_vocabulary import PlaceIndex
 
@@ -26,7 +27,9 @@ log = logging.getLogger(__name__)
 # Two matches in a row must agree before a sequence is moved into a loaded map: by this much, within this time.
 _AGREE_M, _AGREE_RAD = 0.5, np.radians(4.0)
 _AGREE_WITHIN_NS = 5 * NANOSECONDS
-# Share of the candidates' similarity near which they are one place, seen from neighbouring keyframes.
+# Keyframes from which the points of a keyframe are triangulated: about two seconds.
+_RECENT_KEYFRAMES = 10
+# Keyframes on both sides of a candidate that show the same place.
 _SAME_PLACE_KEYFRAMES = 3
 
 
@@ -82,6 +85,7 @@ class BowLoop(LoopCloser):
             self._camera, corners=options.corners, threshold=options.threshold, cell_px=options.cell_px
         )
         self._index = PlaceIndex(branching=options.branching, capacity=options.leaf_capacity)
+        self._recent = RecentPoints(keyframes=_RECENT_KEYFRAMES, focal_px=self._focal_px)
         self._places: list[_Place] = []
         given = None if self._load_from is None else load_map(self._load_from, self._camera)
         self._trajectory = KeyframeTrajectory(self._graph, None if given is None else given.T_map_body)
@@ -96,9 +100,10 @@ class BowLoop(LoopCloser):
     def add_keyframe(self, keyframe: LoopKeyframe) -> LoopMatch | None:
         """Take the next keyframe; a match, if it sees a known place, is already part of the correction."""
         trajectory = self._ready()
+        T_body_cam = self._camera.T_body_cam if keyframe.T_body_cam is None else keyframe.T_body_cam
+        self._recent.push(keyframe, T_body_cam)
         if self._is_near_the_last(keyframe.T_world_body):
             return None
-        T_body_cam = self._camera.T_body_cam if keyframe.T_body_cam is None else keyframe.T_body_cam
         down_cam = -(keyframe.T_world_body[:3, :3] @ T_body_cam[:3, :3])[2]
         seen = self._describer.describe(keyframe.image, keyframe.tracks, down_cam)
         node = trajectory.add(keyframe.stamp_ns, keyframe.T_world_body, broken=self._interrupted)
@@ -114,6 +119,7 @@ class BowLoop(LoopCloser):
     def settle(self, stamps_ns: Stamps, T_world_body: Array) -> None:
         """Take better estimates (N, 4, 4), in the odometry frame, of keyframes added before; unknown stamps pass."""
         self._ready().settle(stamps_ns, T_world_body)
+        self._recent.settle(stamps_ns, T_world_body)
 
     def refine(self, match_id: int, T_world_loop: Array, T_world_body: Array) -> None:
         """Take a better relative pose of a match."""
@@ -122,6 +128,7 @@ class BowLoop(LoopCloser):
     def interrupt(self) -> None:
         """The smoother started again: the step from the last keyframe to the next is not to be trusted."""
         self._interrupted = True
+        self._recent.forget()
 
     @property
     def T_map_world(self) -> Array:
@@ -186,13 +193,14 @@ class BowLoop(LoopCloser):
 
     def _find(self, keyframe: LoopKeyframe, T_body_cam: Array, seen: Appearance, node: int) -> LoopMatch | None:
         """A remembered keyframe that sees the same place, or None."""
-        _, corners, rows = np.intersect1d(seen.ids, keyframe.landmark_ids, return_indices=True)
-        if len(rows) < self._verification.min_matches:
+        candidates = self._candidates(keyframe.stamp_ns, seen)
+        if not candidates:
             return None
+        ids, points_world = self._recent.seen_now(keyframe)
+        ids, corners, rows = np.intersect1d(seen.ids, ids, return_indices=True)
         # Around the body, so that the far end of a long walk is no worse than its beginning.
-        T_body_world = se3.inverse(keyframe.T_world_body)
-        points = se3.transform(T_body_world, keyframe.landmarks_world[rows])
-        for number in self._candidates(keyframe.stamp_ns, seen):
+        points = se3.transform(se3.inverse(keyframe.T_world_body), points_world[rows])
+        for number in candidates:
             place = self._places[number]
             self._count("loop candidates")
             found = locate(
@@ -204,7 +212,7 @@ class BowLoop(LoopCloser):
             if not self._is_plausible(place, keyframe, keyframe.T_world_body @ T_body_loop, node):
                 self._count("loop candidates refused")
                 continue
-            return self._close(place, keyframe, T_body_loop, found, rows, node)
+            return self._close(place, keyframe, T_body_loop, found, ids, node)
         return None
 
     def _candidates(self, stamp_ns: int, seen: Appearance) -> list[int]:
@@ -257,7 +265,7 @@ class BowLoop(LoopCloser):
         return bool(np.linalg.norm(apart) < _AGREE_M and abs(turned) < _AGREE_RAD)
 
     def _close(
-        self, place: _Place, keyframe: LoopKeyframe, T_body_loop: Array, found: Found, rows: np.ndarray, node: int
+        self, place: _Place, keyframe: LoopKeyframe, T_body_loop: Array, found: Found, ids: Stamps, node: int
     ) -> LoopMatch:
         trajectory = self._ready()
         T_world_loop = keyframe.T_world_body @ T_body_loop
@@ -265,14 +273,16 @@ class BowLoop(LoopCloser):
             trajectory.move_into_map(*trajectory.implied_correction(place.node, se3.inverse(T_world_loop)))
         number = trajectory.match(place.node, node, se3.inverse(T_body_loop))
         self._count("loop closures")
+        held = np.isin(ids[found.points], keyframe.landmark_ids)
+        points, corners = found.points[held], found.corners[held]
         return LoopMatch(
             match_id=number,
             stamp_ns=keyframe.stamp_ns,
             loop_stamp_ns=place.stamp_ns,
             T_world_loop=T_world_loop,
-            landmark_ids=keyframe.landmark_ids[rows[found.points]],
-            pixels=place.appearance.pixels[found.corners],
-            bearings=place.appearance.bearings[found.corners],
+            landmark_ids=ids[points],
+            pixels=place.appearance.pixels[corners],
+            bearings=place.appearance.bearings[corners],
         )
 
     def _thin(self) -> None:
