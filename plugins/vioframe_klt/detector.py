@@ -4,13 +4,12 @@ import cv2
 import numpy as np
 
 from vioframe.checks import Array
+from vioframe.vision.spread import choose_spread
 
 # OpenCV's cornerMinEigenVal (3×3 Sobel, image in [0, 1]) returns four times the smaller eigenvalue of the mean
 # of ∇I∇Iᵀ over the block, measured against finite differences.
 _EIGENVALUE_UNIT = 4.0
 _BLOCK = 3
-_CELLS = (8, 5)
-_CANDIDATES = 400
 
 
 class CornerDetector:
@@ -51,11 +50,17 @@ class CornerDetector:
         rows, columns = np.nonzero(candidates)
         if len(rows) == 0 or count <= 0:
             return np.zeros((0, 2))
-        values = strength[rows, columns]
-        points, values = _best_of_cells(np.stack([columns, rows], axis=-1), values, self._distance)
-        # More candidates than this change nothing but the time that the pairwise distances take.
-        points = points[self._spread(points, values, taken / scale)][: max(_CANDIDATES, 2 * count)]
-        points = points[_spaced(points, self._distance)][:count]
+        points = np.stack([columns, rows], axis=-1)
+        height, width = strength.shape
+        chosen = choose_spread(
+            points,
+            strength[rows, columns],
+            taken / scale,
+            size_px=(width, height),
+            distance=self._distance,
+            count=count,
+        )
+        points = points[chosen]
         refined = _refine(strength, points)
         # The centre of pixel x of the half-size image lies at 2x + 0.5 of the full one.
         return refined * scale + 0.5 * (scale - 1)
@@ -70,52 +75,6 @@ class CornerDetector:
         marks[row, column] = 0
         free: np.ndarray = self._allowed & (cv2.distanceTransform(marks, cv2.DIST_L2, 3) >= self._distance)
         return free
-
-    def _spread(self, points: Array, values: Array, taken: Array) -> np.ndarray:
-        """Order corners so that the emptiest parts of the image come first, and strong before weak in each."""
-        height, width = self._allowed.shape
-        cells = np.array([width / _CELLS[0], height / _CELLS[1]])
-
-        def cell_of(pixels: Array) -> np.ndarray:
-            index = np.clip((pixels / cells).astype(int), 0, np.array(_CELLS) - 1)
-            flat: np.ndarray = index[:, 1] * _CELLS[0] + index[:, 0]
-            return flat
-
-        occupied = np.bincount(cell_of(taken), minlength=_CELLS[0] * _CELLS[1])
-        cell = cell_of(points)
-        by_cell = np.lexsort((-values, cell))
-        ordered = cell[by_cell]
-        first = np.searchsorted(ordered, ordered)
-        rank = np.empty(len(points), dtype=int)
-        rank[by_cell] = np.arange(len(points)) - first
-        order: np.ndarray = np.lexsort((-values, occupied[cell] + rank))
-        return order
-
-
-def _best_of_cells(points: np.ndarray, values: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Keep the strongest candidate of every square cell of half the distance."""
-    cell = (points / (0.5 * size)).astype(np.int64)
-    key = cell[:, 1] * 65536 + cell[:, 0]
-    order = np.lexsort((-values, key))
-    _, first = np.unique(key[order], return_index=True)
-    best = order[first]
-    return points[best], values[best]
-
-
-def _spaced(points: np.ndarray, distance: float) -> np.ndarray:
-    """Indices of a greedy choice, in the order given, with a minimum distance; a round takes many at once."""
-    count = len(points)
-    x, y = points[:, 0].astype(np.float32), points[:, 1].astype(np.float32)
-    near = ((x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 < distance * distance).astype(np.float32)
-    # Sums of 0 and 1 as matrix products, because reducing boolean arrays is slow.
-    near_earlier = np.tril(near, k=-1)
-    alive = np.ones(count, dtype=bool)
-    kept = np.zeros(count, dtype=bool)
-    while alive.any():
-        winners = alive & (near_earlier @ alive.astype(np.float32) == 0.0)
-        kept |= winners
-        alive &= near @ winners.astype(np.float32) == 0.0
-    return np.flatnonzero(kept)
 
 
 def _refine(strength: np.ndarray, points: np.ndarray) -> Array:

@@ -1,4 +1,4 @@
-"""The front end: points followed from a reference image, checked there and back."""
+"""The front end: corners followed from image to image, held by the patch they began with."""
 
 import logging
 from collections.abc import Mapping
@@ -7,34 +7,42 @@ from typing import ClassVar
 import cv2
 import numpy as np
 
-from vioframe.checks import Array
-from vioframe.errors import ConfigError, DataError, ShapeError, StateError
+from vioframe.checks import Array, Mask
+from vioframe.errors import ConfigError, DataError, StateError
 from vioframe.geometry import camera as projection
 from vioframe.interfaces import IMAGES, STEREO, STEREO_TRACKS, TRACKS, Frontend
 from vioframe.types import Camera, Frame, Image, SensorRig, Tracks, VisualFeatures
+from vioframe.vision.gray import gray_image, normalise_exposure
+from vioframe.vision.outliers import epipolar_inliers
+from vioframe.vision.spread import crowded
+from vioframe.vision.two_cameras import TwoCameras
+from vioframe_klt.anchors import Anchors
 from vioframe_klt.detector import CornerDetector
-from vioframe_klt.outliers import epipolar_inliers
+from vioframe_klt.points import Points, inside
+from vioframe_klt.search import Search
 from vioframe_klt.stereo import StereoMatcher
 
 log = logging.getLogger(__name__)
 
-_TARGET_MEAN, _TARGET_DEVIATION = 118.0, 52.0
-# More contrast than this would turn sensor noise of a dark or empty image into texture.
-_MAX_GAIN = 4.0
-_LEVELS_BACK = 1
-# The reference image is also renewed when fewer than this share of its points is left, and, where the image has
-# few corners, every so many images in the hope of more.
-_MIN_KEPT = 0.85
-_SPARSE = 0.5
-_RETRY_IMAGES = 10
+# New corners are taken when fewer than this share of the points is left; where the image has few corners, every so
+# many images in the hope of more; and where there is next to nothing, at once.
+_MIN_KEPT = 0.9
+_SCARCE = 0.3
+_RETRY_IMAGES = 5
 _INVERTIBLE_PX = 0.5
+# A template bent by more than this in any direction no longer shows what the image can.
+_MAX_STRETCH = 2.0
+_FEWEST_JUDGED = 8
+# With so many lost for each that is left, what is left is most likely chance, unless it is as many as this.
+_MANY_LOST = 5
+_ENOUGH = 20
 
 
 class KltFrontend(Frontend):
     """Shi-Tomasi corners followed by pyramidal Lucas–Kanade (Bouguet 2001), with lasting ids.
 
-    A point is searched for in the new image as it looked in a *reference* image a few frames back, which is
-    renewed when the view has moved; frame-to-frame tracking is the special case ``reference_flow_px=0``.
+    Lucas–Kanade from the image before finds a point; aligning the patch it began with, under an affine warp, then
+    says where exactly it is, and whether it still is the same point. Errors so do not add up along a track.
 
     Args:
         stereo: also find the points in camera 1.
@@ -44,12 +52,14 @@ class KltFrontend(Frontend):
         quality: fraction of the strongest corner's smaller eigenvalue a corner needs.
         min_gradient: square root of that eigenvalue a corner needs at least, grey levels a pixel.
         detection_scale: 1, or 2 to look for corners in the half-size image.
-        window_px: odd side of the patch.
+        window_px: odd side of the patch that is searched for.
         levels: pyramid levels above the full image.
         max_steps: of Lucas–Kanade, a level.
         step_px: shorter steps end the search.
-        forward_backward_px: largest distance of a point followed there and back from its start.
-        reference_flow_px: median displacement at which the reference image is renewed.
+        anchor_window_px: odd side of the patch that a point began with.
+        anchor_steps: to align it, an image.
+        anchor_reach_px: largest distance of the aligned point from where the search put it.
+        min_correlation: of the patch that a point began with and what is seen now.
         predict_rotation: start the search where the gyro's rotation puts the point.
         reject_outliers: by the epipolar geometry of this image and the one before.
         outlier_px: distance from the epipolar line that contradicts it.
@@ -71,17 +81,19 @@ class KltFrontend(Frontend):
         *,
         stereo: bool = False,
         min_depth: float = 0.4,
-        max_points: int = 180,
+        max_points: int = 150,
         min_distance_px: float = 22.0,
         quality: float = 0.01,
         min_gradient: float = 1.0,
         detection_scale: int = 2,
-        window_px: int = 21,
+        window_px: int = 15,
         levels: int = 3,
-        max_steps: int = 20,
-        step_px: float = 0.02,
-        forward_backward_px: float = 0.7,
-        reference_flow_px: float = 20.0,
+        max_steps: int = 10,
+        step_px: float = 0.03,
+        anchor_window_px: int = 19,
+        anchor_steps: int = 2,
+        anchor_reach_px: float = 2.0,
+        min_correlation: float = 0.8,
         predict_rotation: bool = True,
         reject_outliers: bool = True,
         outlier_px: float = 1.5,
@@ -102,8 +114,11 @@ class KltFrontend(Frontend):
         _require("levels", levels, 0 <= levels <= 8, "from 0 to 8")
         _require("max_steps", max_steps, max_steps >= 1, "at least 1")
         _require("step_px", step_px, step_px > 0.0, "positive")
-        _require("forward_backward_px", forward_backward_px, forward_backward_px > 0.0, "positive")
-        _require("reference_flow_px", reference_flow_px, reference_flow_px >= 0.0, "not negative")
+        sound = anchor_window_px >= 7 and anchor_window_px % 2 == 1
+        _require("anchor_window_px", anchor_window_px, sound, "odd and at least 7")
+        _require("anchor_steps", anchor_steps, anchor_steps >= 1, "at least 1")
+        _require("anchor_reach_px", anchor_reach_px, anchor_reach_px > 0.0, "positive")
+        _require("min_correlation", min_correlation, 0.0 <= min_correlation < 1.0, "at least 0 and below 1")
         _require("outlier_px", outlier_px, outlier_px > 0.0, "positive")
         _require("clahe_clip", clahe_clip, clahe_clip > 0.0, "positive")
         _require("clahe_tiles", clahe_tiles, clahe_tiles >= 1, "at least 1")
@@ -121,11 +136,14 @@ class KltFrontend(Frontend):
         self._quality = quality
         self._min_gradient = min_gradient
         self._detection_scale = detection_scale
-        self._window = (window_px, window_px)
+        self._window = window_px
         self._levels = levels
-        self._criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, max_steps, step_px)
-        self._back_px = forward_backward_px
-        self._reference_flow = reference_flow_px
+        self._max_steps = max_steps
+        self._step_px = step_px
+        self._anchor_window = anchor_window_px
+        self._anchor_steps = anchor_steps
+        self._anchor_reach = anchor_reach_px
+        self._min_correlation = min_correlation
         self._predict = predict_rotation
         self._reject = reject_outliers
         self._outlier_px = outlier_px
@@ -144,34 +162,37 @@ class KltFrontend(Frontend):
         """
         if not rig.cameras:
             raise DataError("frontend=klt needs a camera, but the recording's calibration has none")
+        if self._stereo and len(rig.cameras) < 2:
+            raise DataError(
+                f"frontend.stereo=true needs two cameras, but the recording's calibration has {len(rig.cameras)}: use "
+                "rig=stereo where it has them, or frontend.stereo=false"
+            )
         camera = rig.cameras[0]
         width, height = camera.size_px
-        if min(width, height) <= 2 * self._border + self._window[0]:
+        if min(width, height) <= 2 * self._border + self._anchor_window:
             raise DataError(
-                f"frontend.border_px={self._border} and window_px={self._window[0]} leave nothing of images of "
-                f"{width}×{height} px: make them smaller"
+                f"frontend.border_px={self._border} and anchor_window_px={self._anchor_window} leave nothing of images "
+                f"of {width}×{height} px: make them smaller"
             )
         self._camera = camera
-        self._matcher = self._stereo_matcher(rig) if self._stereo else None
-        allowed = np.zeros((height, width), np.uint8)
-        inner = slice(self._border, height - self._border), slice(self._border, width - self._border)
-        allowed[inner] = 255
-        self._invertible = cv2.resize(self._usable(camera), (width, height), interpolation=cv2.INTER_NEAREST)
-        allowed &= self._invertible
+        self._allowed = _usable(camera, self._border, self._max_angle_deg)
         self._detector = CornerDetector(
             min_distance_px=self._min_distance,
             quality=self._quality,
             min_gradient=self._min_gradient,
             scale=self._detection_scale,
-            allowed=allowed,
+            allowed=self._allowed,
         )
+        self._search = self._searcher(camera)
+        self._matcher = self._stereo_matcher(rig) if self._stereo else None
         self._next_id = 0
         self._images = 0
         self._lost_all = 0
-        self._reference_age = 0
-        self._reference_count = 0
-        self._reference: Image | None = None
-        self._points = _Points.none()
+        self._since_corners = 0
+        self._after_corners = 0
+        self._before: Image | None = None
+        self._points = Points.none()
+        self._anchors = Anchors(self._anchor_window)
 
     def counters(self) -> Mapping[str, int]:
         """How often every point was lost at once."""
@@ -189,215 +210,125 @@ class KltFrontend(Frontend):
         if self._camera is None:
             raise StateError("KltFrontend.process was called before setup(rig): set it up first")
         gray = self._prepare(frame, 0, self._camera)
-        points = self._points
-        if self._reference is not None and len(points):
-            points = self._follow(self._reference, gray, points, R_prev_cur, self._camera)
-            if len(points) == 0:
+        right = self._prepare(frame, 1, self._matcher.cameras.right) if self._matcher else None
+        if self._before is not None and len(self._points):
+            self._follow(self._before, gray, R_prev_cur, self._camera)
+            if len(self._points) == 0:
                 self._lost_all += 1
                 log.warning("KLT: all points were lost at stamp %d ns", frame.stamp_ns)
-        room = self._max_points - len(points)
-        flow = float(np.median(np.linalg.norm(points.pixels - points.reference, axis=-1))) if len(points) else np.inf
-        # Losing many points is a change of view even where the median hardly moved.
-        self._reference_age += 1
-        worn = len(points) < _MIN_KEPT * self._reference_count
-        sparse = len(points) < _SPARSE * self._max_points and self._reference_age >= _RETRY_IMAGES
-        if self._reference is None or flow > self._reference_flow or worn or sparse:
-            self._reference = gray
-            points = self._renew(gray, points, room)
-            self._reference_age, self._reference_count = 0, len(points)
-        self._points = points
+        self._since_corners += 1
+        count = len(self._points)
+        worn = count < _MIN_KEPT * self._after_corners
+        hopeful = self._since_corners >= _RETRY_IMAGES or count < _SCARCE * self._max_points
+        if count < _MIN_KEPT * self._max_points and (worn or hopeful):
+            self._take_corners(gray, self._camera)
+        self._before = gray
+        self._images += 1
+        points = self._points
         tracks = Tracks(
-            ids=points.ids,
-            pixels=points.pixels,
-            bearings=projection.bearings(self._camera, points.pixels),
-            scores=points.ages.astype(float),
+            ids=points.ids, pixels=points.pixels, bearings=points.bearings, scores=points.ages.astype(float)
         )
-        if self._matcher is None:
-            return VisualFeatures(frame=frame, tracks=tracks)
-        right = self._prepare(frame, 1, self._matcher.right)
-        return VisualFeatures(frame=frame, tracks=tracks, stereo=self._matcher.match(gray, right, tracks))
+        stereo = None
+        if self._matcher is not None and right is not None:
+            stereo = self._matcher.match(gray, right, tracks, self._anchors)
+        return VisualFeatures(frame=frame, tracks=tracks, stereo=stereo)
+
+    def _searcher(self, camera: Camera) -> Search:
+        return Search(
+            camera, window_px=self._window, levels=self._levels, max_steps=self._max_steps, step_px=self._step_px
+        )
 
     def _stereo_matcher(self, rig: SensorRig) -> StereoMatcher:
-        if len(rig.cameras) < 2:
-            raise DataError(
-                f"frontend.stereo=true needs two cameras, but the recording's calibration has {len(rig.cameras)}: use "
-                "rig=stereo where it has them, or frontend.stereo=false"
-            )
+        left, right = rig.cameras[:2]
         return StereoMatcher(
-            rig.cameras[0],
-            rig.cameras[1],
-            window_px=self._window[0],
-            levels=self._levels,
-            criteria=self._criteria,
-            forward_backward_px=self._back_px,
-            epipolar_px=self._outlier_px,
-            min_depth=self._min_depth,
-            border_px=self._border,
+            TwoCameras(left, right, epipolar_px=self._outlier_px, min_depth=self._min_depth),
+            self._searcher(right),
+            allowed=_usable(right, self._border, self._max_angle_deg),
+            anchor_steps=self._anchor_steps,
+            anchor_reach_px=self._anchor_reach,
+            min_correlation=self._min_correlation,
         )
 
-    def _usable(self, camera: Camera) -> np.ndarray:
-        """Every fourth pixel (H/4, W/4) uint8: 255 where the camera model can be inverted and the angle is allowed."""
-        width, height = camera.size_px
-        columns, rows = np.meshgrid(np.arange(0, width, 4.0), np.arange(0, height, 4.0))
-        pixels = np.stack([columns, rows], axis=-1)
-        # Beyond the range of its polynomial, a radial-tangential model folds back: its inverse then diverges.
-        with np.errstate(all="ignore"):
-            rays = projection.bearings(camera, pixels)
-            back, _ = projection.project(camera, rays)
-            usable = np.linalg.norm(back - pixels, axis=-1) < _INVERTIBLE_PX
-        if self._max_angle_deg is not None:
-            usable &= rays[..., 2] >= np.cos(np.radians(self._max_angle_deg))
-        mask: np.ndarray = usable.astype(np.uint8) * 255
-        return mask
-
     def _prepare(self, frame: Frame, index: int, camera: Camera) -> Image:
-        if len(frame.images) <= index:
-            raise DataError(
-                f"frame at {frame.stamp_ns} ns has no image of camera {index}, and frontend=klt needs "
-                f"{'one' if index == 0 else 'both where stereo=true'}"
-            )
-        image = frame.images[index]
-        if image.shape[:2] != camera.size_px[::-1]:
-            raise ShapeError(
-                f"image of camera {index} at {frame.stamp_ns} ns is {image.shape[1]}×{image.shape[0]} px, but its "
-                f"calibration says {camera.size_px[0]}×{camera.size_px[1]}: correct the calibration or the images"
-            )
-        gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        gray = gray_image(frame, index, camera, "klt")
         if self._clahe is not None:
             gray = self._clahe.apply(gray)
-        if self._normalise:
-            mean, deviation = (float(v[0, 0]) for v in cv2.meanStdDev(gray))
-            gain = min(_TARGET_DEVIATION / max(deviation, 1e-3), _MAX_GAIN)
-            levels = np.arange(256.0)
-            table = np.clip(np.rint(_TARGET_MEAN + gain * (levels - mean)), 0, 255).astype(np.uint8)
-            gray = cv2.LUT(gray, table)
-        return np.ascontiguousarray(gray)
+        return normalise_exposure(gray) if self._normalise else gray
 
-    def _follow(
-        self,
-        reference: Image,
-        gray: Image,
-        points: "_Points",
-        R_prev_cur: Array | None,
-        camera: Camera,
-    ) -> "_Points":
-        """The points that are found again in the image ``gray``."""
+    def _follow(self, before: Image, gray: Image, R_prev_cur: Array | None, camera: Camera) -> None:
+        """Keep the points that are found again in the image ``gray``."""
         R_cam = None
-        expected = points.pixels
-        bearings = projection.bearings(camera, points.pixels)
         if R_prev_cur is not None and self._predict:
             R_body_cam = camera.T_body_cam[:3, :3]
             R_cam = R_body_cam.T @ R_prev_cur @ R_body_cam
-            turned, visible = projection.project(camera, bearings @ R_cam)
-            expected = np.where(visible[:, None], turned, points.pixels)
-        start = points.reference.astype(np.float32)
-        # OpenCV's Python binding takes no pyramid built before (cv2.buildOpticalFlowPyramid), only images.
-        found, status, _ = cv2.calcOpticalFlowPyrLK(
-            reference,
-            gray,
-            start,
-            expected.astype(np.float32),
-            winSize=self._window,
-            maxLevel=self._levels,
-            criteria=self._criteria,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        count = len(self._points)
+        found, turn, good = self._search.follow(before, gray, self._points.pixels, self._points.bearings, R_cam)
+        good &= inside(self._allowed, found)
+        self._keep(good)
+        found = found[good]
+        bend = self._anchors.bend if turn is None else turn[good] @ self._anchors.bend
+        pixels, self._anchors.bend, correlation = self._anchors.align(gray, found, bend, self._anchor_steps)
+        good = (
+            (correlation > self._min_correlation)
+            & (np.linalg.norm(pixels - found, axis=-1) < self._anchor_reach)
+            & inside(self._allowed, pixels)
         )
-        # Starting at the reference position would hide a search that ran away by little; starting where the
-        # whole way back is asked of it would fail on large motion. One level up bridges both.
-        back, back_status, _ = cv2.calcOpticalFlowPyrLK(
-            gray,
-            reference,
-            found,
-            start.copy(),
-            winSize=self._window,
-            maxLevel=min(_LEVELS_BACK, self._levels),
-            criteria=self._criteria,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )
-        width, height = camera.size_px
-        low = self._border - 0.5
-        keep = (
-            (status[:, 0] > 0)
-            & (back_status[:, 0] > 0)
-            & (np.linalg.norm(back - start, axis=-1) < self._back_px)
-            & (found[:, 0] > low)
-            & (found[:, 1] > low)
-            & (found[:, 0] < width - 1 - low)
-            & (found[:, 1] < height - 1 - low)
-        )
-        column = np.clip(np.rint(found[:, 0]), 0, width - 1).astype(int)
-        row = np.clip(np.rint(found[:, 1]), 0, height - 1).astype(int)
-        keep &= self._invertible[row, column] > 0
-        followed = points.select(keep).moved(found[keep].astype(float))
-        if self._reject and len(followed) >= 8:
-            focal = float(np.mean(camera.intrinsics_px[:2]))
-            inliers = epipolar_inliers(
-                bearings[keep],
-                projection.bearings(camera, followed.pixels),
-                R_cam,
-                self._outlier_px / focal,
-                seed=self._images,
-            )
-            followed = followed.select(inliers)
-        self._images += 1
-        return followed
+        self._keep(good)
+        pixels = pixels[good]
+        bearings = projection.bearings(camera, pixels)
+        before_bearings = self._points.bearings
+        self._points = self._points.moved(pixels, bearings)
+        if self._reject:
+            self._keep(self._agreeing(before_bearings, bearings, R_cam, camera, lost=count - len(pixels)))
+        stretch = np.linalg.svd(self._anchors.bend, compute_uv=False)
+        rows = np.flatnonzero((stretch[:, 0] > _MAX_STRETCH) | (stretch[:, 1] < 1.0 / _MAX_STRETCH))
+        if len(rows):
+            self._anchors.renew(gray, self._points.pixels[rows], rows)
 
-    def _renew(self, gray: Image, points: "_Points", room: int) -> "_Points":
-        """Make this image the reference, and take new corners."""
-        crowded = _too_close(points, 0.5 * self._min_distance)
-        points = points.select(~crowded)
-        corners = self._detector.detect(gray, points.pixels, room + int(crowded.sum()))
+    def _agreeing(self, before: Array, now: Array, R_cam: Array | None, camera: Camera, lost: int) -> Mask:
+        """Which points (M,) move as the rest; none where so few are left of many that they cannot be judged."""
+        agree = np.ones(len(now), dtype=bool)
+        if len(now) >= _FEWEST_JUDGED:
+            threshold = self._outlier_px / float(np.mean(camera.intrinsics_px[:2]))
+            agree = epipolar_inliers(before, now, R_cam, threshold, seed=self._images)
+        left = int(agree.sum())
+        return agree & (left >= _ENOUGH or lost + len(now) - left < _MANY_LOST * left)
+
+    def _keep(self, keep: Mask) -> None:
+        if not keep.all():
+            self._points = self._points.select(keep)
+            self._anchors.select(keep)
+
+    def _take_corners(self, gray: Image, camera: Camera) -> None:
+        """Thin points that have run together, and take new corners where there is room."""
+        points = self._points
+        self._keep(~crowded(points.pixels, points.ages, points.ids, 0.5 * self._min_distance))
+        corners = self._detector.detect(gray, self._points.pixels, self._max_points - len(self._points))
         ids = np.arange(self._next_id, self._next_id + len(corners), dtype=np.int64)
         self._next_id += len(corners)
-        pixels = np.concatenate([points.pixels, corners])
-        return _Points(
-            ids=np.concatenate([points.ids, ids]),
-            pixels=pixels,
-            reference=pixels,
-            ages=np.concatenate([points.ages, np.ones(len(corners), dtype=np.int64)]),
-        )
+        self._points = self._points.joined(ids, corners, projection.bearings(camera, corners))
+        self._anchors.add(gray, corners)
+        self._since_corners, self._after_corners = 0, len(self._points)
 
 
-class _Points:
-    """Parallel arrays: ids (M,), pixels in the last image and in the reference (M, 2), images seen in (M,)."""
-
-    __slots__ = ("ages", "ids", "pixels", "reference")
-
-    def __init__(self, *, ids: np.ndarray, pixels: Array, reference: Array, ages: np.ndarray) -> None:
-        self.ids = ids
-        self.pixels = pixels
-        self.reference = reference
-        self.ages = ages
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    @staticmethod
-    def none() -> "_Points":
-        empty = np.zeros(0, dtype=np.int64)
-        return _Points(ids=empty, pixels=np.zeros((0, 2)), reference=np.zeros((0, 2)), ages=empty)
-
-    def select(self, keep: np.ndarray) -> "_Points":
-        return _Points(
-            ids=self.ids[keep], pixels=self.pixels[keep], reference=self.reference[keep], ages=self.ages[keep]
-        )
-
-    def moved(self, pixels: Array) -> "_Points":
-        return _Points(ids=self.ids, pixels=pixels, reference=self.reference, ages=self.ages + 1)
-
-
-def _too_close(points: _Points, distance: float) -> np.ndarray:
-    """Mark the younger of two points that have run together (M,)."""
-    count = len(points)
-    if count < 2:
-        return np.zeros(count, dtype=bool)
-    offsets = points.pixels[:, None] - points.pixels[None]
-    near = (offsets * offsets).sum(axis=-1) < distance * distance
-    older = (points.ages[None] > points.ages[:, None]) | (
-        (points.ages[None] == points.ages[:, None]) & (points.ids[None] < points.ids[:, None])
-    )
-    crowded: np.ndarray = (near & older).any(axis=1)
-    return crowded
+def _usable(camera: Camera, border: int, max_angle_deg: float | None) -> np.ndarray:
+    """255 in (H, W) uint8 where points are followed: off the edge, in the range of the camera model, and near enough
+    to the optical axis; decided at every fourth pixel."""
+    width, height = camera.size_px
+    columns, rows = np.meshgrid(np.arange(0, width, 4.0), np.arange(0, height, 4.0))
+    pixels = np.stack([columns, rows], axis=-1)
+    # Beyond the range of its polynomial, a radial-tangential model folds back: its inverse then diverges.
+    with np.errstate(all="ignore"):
+        rays = projection.bearings(camera, pixels)
+        back, _ = projection.project(camera, rays)
+        usable = np.linalg.norm(back - pixels, axis=-1) < _INVERTIBLE_PX
+    if max_angle_deg is not None:
+        usable &= rays[..., 2] >= np.cos(np.radians(max_angle_deg))
+    mask = cv2.resize(usable.astype(np.uint8) * 255, (width, height), interpolation=cv2.INTER_NEAREST)
+    allowed = np.zeros((height, width), np.uint8)
+    inner = slice(border, height - border), slice(border, width - border)
+    allowed[inner] = mask[inner]
+    return allowed
 
 
 def _require(option: str, value: object, good: bool, rule: str) -> None:

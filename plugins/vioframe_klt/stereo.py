@@ -1,16 +1,16 @@
 """The points of camera 0, found in the image of camera 1 at the same instant."""
 
-import cv2
 import numpy as np
 
 from vioframe.checks import Array, Mask, Stamps
-from vioframe.errors import DataError
 from vioframe.geometry import camera as projection
-from vioframe.geometry import se3
-from vioframe.types import Camera, Image, Tracks
+from vioframe.types import Image, Tracks
+from vioframe.vision.two_cameras import TwoCameras
+from vioframe_klt.anchors import Anchors
+from vioframe_klt.points import inside
+from vioframe_klt.search import Search
 
 _LEVELS_NEAR = 1
-_LEVELS_BACK = 1
 # The search converges from within about this far; unknown depths are tried in steps of it along the epipolar line.
 _REACH_PX = 40.0
 _MAX_HYPOTHESES = 4
@@ -22,71 +22,53 @@ _NEIGHBOURS = 5
 class StereoMatcher:
     """Lucas–Kanade from camera 0 to camera 1, started on the epipolar line at the depth last seen.
 
-    Works for any rig whose views overlap; nothing is rectified.
+    The patch a point began with then says where exactly it is, as it does in camera 0.
 
     Args:
-        left: camera 0.
-        right: camera 1.
-        window_px: odd side of the patch.
-        levels: pyramid levels above the full image, where the depth is not yet known.
-        criteria: of Lucas–Kanade, as OpenCV takes them.
-        forward_backward_px: largest distance of a point matched there and back from its start.
-        epipolar_px: largest distance from the epipolar line.
-        min_depth: nearer points are not matched, m.
-        border_px: no matches nearer to the edge of the image.
-
-    Raises:
-        DataError: the cameras sit at the same place.
+        cameras: their geometry.
+        search: in images of camera 1.
+        allowed: (H, W) uint8, zero where no match may lie.
+        anchor_steps: to align a patch.
+        anchor_reach_px: largest distance of the aligned point from where the search put it.
+        min_correlation: of the patch that a point began with and what camera 1 sees.
     """
 
     def __init__(
         self,
-        left: Camera,
-        right: Camera,
+        cameras: TwoCameras,
+        search: Search,
         *,
-        window_px: int,
-        levels: int,
-        criteria: tuple[int, int, float],
-        forward_backward_px: float,
-        epipolar_px: float,
-        min_depth: float,
-        border_px: int,
+        allowed: np.ndarray,
+        anchor_steps: int,
+        anchor_reach_px: float,
+        min_correlation: float,
     ) -> None:
-        self.right = right
-        T_right_left = se3.inverse(right.T_body_cam) @ left.T_body_cam
-        self._R_right_left, self._base = T_right_left[:3, :3], T_right_left[:3, 3]
-        baseline = float(np.linalg.norm(self._base))
-        if baseline < 1e-4:
-            raise DataError(f"frontend.stereo needs two cameras apart from each other, but theirs is {baseline:.2g} m")
-        focal = float(np.mean(right.intrinsics_px[:2]))
-        widest = focal * baseline / min_depth
+        self.cameras = cameras
+        self._search = search
+        self._allowed = allowed
+        self._steps = anchor_steps
+        self._reach_px = anchor_reach_px
+        self._min_correlation = min_correlation
+        widest = cameras.focal_px * cameras.baseline * cameras.max_inverse_depth
         count = int(np.clip(np.ceil(widest / (2.0 * _REACH_PX)), 1, _MAX_HYPOTHESES))
-        self._guesses = (np.arange(count) + 0.5) / count / min_depth
-        self._max_inverse_depth = 1.0 / min_depth
-        self._threshold = epipolar_px / focal
-        # So much beyond infinity does noise put a point that is far away.
-        self._least_inverse_depth = -2.0 * self._threshold / baseline
-        self._back_px = forward_backward_px
-        self._window = (window_px, window_px)
-        self._levels = levels
-        self._criteria = criteria
-        self._border = border_px
+        self._guesses = (np.arange(count) + 0.5) / count * cameras.max_inverse_depth
         self._images = 0
         self._ids: Stamps = np.zeros(0, dtype=np.int64)
         self._inverse_depth: Array = np.zeros(0)
 
-    def match(self, left: Image, right: Image, tracks: Tracks) -> Tracks:
+    def match(self, left: Image, right: Image, tracks: Tracks, anchors: Anchors) -> Tracks:
         """The points of ``tracks`` that are found in camera 1.
 
         Args:
             left: (H, W) uint8 of camera 0, exposed as ``right``.
             right: (H, W) uint8 of camera 1.
             tracks: of camera 0, ids ascending.
+            anchors: the patches they began with.
         """
         count = len(tracks)
         pixels = np.zeros((count, 2))
         bearings = np.zeros((count, 3))
-        # NaN is not known; 1/z in camera 0.
+        # 1/z in camera 0; NaN is not known.
         inverse_depth = np.full(count, np.nan)
         remembered = self._remembered(tracks.ids)
         guess = self._borrowed(tracks.bearings, remembered)
@@ -94,16 +76,17 @@ class StereoMatcher:
         retry = blind or self._images % _RETRY_IMAGES == 0
         fresh = ~np.isin(tracks.ids, self._ids, assume_unique=True)
         wanted = ~np.isnan(remembered) | fresh | retry
-        rounds = [] if blind else [(guess, _LEVELS_NEAR)]
+        rounds: list[tuple[Array, int | None]] = [] if blind else [(guess, _LEVELS_NEAR)]
         if retry:
-            rounds += [(np.full(count, depth), self._levels) for depth in self._guesses]
+            rounds += [(np.full(count, depth), None) for depth in self._guesses]
         for index, (start, levels) in enumerate(rounds):
             rows = np.flatnonzero(wanted & np.isnan(inverse_depth) & ((index == 0) | np.isnan(remembered)))
             if len(rows) == 0:
                 continue
-            there, found = self._search(left, right, tracks, start, rows, levels)
-            rays, depths, fits = self._consistent(tracks.bearings[rows], there)
-            good = found & fits
+            there, found = self._find(left, right, tracks, anchors, start, rows, levels)
+            rays = projection.bearings(self.cameras.right, there)
+            depths, possible = self.cameras.inverse_depth(tracks.bearings[rows], rays)
+            good = found & possible
             pixels[rows[good]], bearings[rows[good]] = there[good], rays[good]
             inverse_depth[rows[good]] = depths[good]
         self._ids, self._inverse_depth = tracks.ids, inverse_depth
@@ -139,61 +122,26 @@ class StereoMatcher:
         filled[unknown] = np.median(inverse_depth[nearest], axis=1)
         return filled
 
-    def _search(
-        self, left: Image, right: Image, tracks: Tracks, inverse_depth: Array, rows: np.ndarray, levels: int
+    def _find(
+        self,
+        left: Image,
+        right: Image,
+        tracks: Tracks,
+        anchors: Anchors,
+        inverse_depth: Array,
+        rows: np.ndarray,
+        levels: int | None,
     ) -> tuple[Array, Mask]:
         """Pixels (K, 2) in camera 1 of the points ``rows``, searched for from a depth, and found (K,)."""
-        rays = tracks.bearings[rows] / np.maximum(tracks.bearings[rows, 2:], 1e-3)
-        ahead = rays @ self._R_right_left.T + inverse_depth[rows, None] * self._base
-        expected, visible = projection.project(self.right, ahead)
-        start = tracks.pixels[rows].astype(np.float32)
-        there, status, _ = cv2.calcOpticalFlowPyrLK(
-            left,
-            right,
-            start,
-            np.where(visible[:, None], expected, start).astype(np.float32),
-            winSize=self._window,
-            maxLevel=levels,
-            criteria=self._criteria,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )
-        back, back_status, _ = cv2.calcOpticalFlowPyrLK(
-            right,
-            left,
-            there,
-            start.copy(),
-            winSize=self._window,
-            maxLevel=min(_LEVELS_BACK, levels),
-            criteria=self._criteria,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )
-        width, height = self.right.size_px
-        low = self._border - 0.5
-        found = (
+        expected, visible = self.cameras.project(tracks.bearings[rows], inverse_depth[rows])
+        start = tracks.pixels[rows]
+        there, found = self._search.there(left, right, start, np.where(visible[:, None], expected, start), levels)
+        pixels, _, correlation = anchors.align(right, there, anchors.bend[rows], self._steps, rows)
+        found &= (
             visible
-            & (status[:, 0] > 0)
-            & (back_status[:, 0] > 0)
-            & (np.linalg.norm(back - start, axis=-1) < self._back_px)
-            & (there > low).all(axis=-1)
-            & (there[:, 0] < width - 1 - low)
-            & (there[:, 1] < height - 1 - low)
+            & (correlation > self._min_correlation)
+            & (np.linalg.norm(pixels - there, axis=-1) < self._reach_px)
+            & inside(self._allowed, pixels)
         )
-        return there.astype(float), found
-
-    def _consistent(self, bearings: Array, pixels: Array) -> tuple[Array, Array, Mask]:
-        """Rays (K, 3) of camera 1, 1/z (K,) in camera 0, and which lie near their epipolar line at a possible depth.
-
-        The inverse depth ρ is the least-squares solution of ``b₁ × (R h₀ + ρ t) = 0``, with ``h₀`` the ray of
-        camera 0 at depth 1.
-        """
-        rays = projection.bearings(self.right, pixels)
-        turned = (bearings / np.maximum(bearings[:, 2:], 1e-3)) @ self._R_right_left.T
-        across_base = np.cross(rays, self._base)
-        inverse_depth = -np.sum(np.cross(rays, turned) * across_base, axis=-1) / np.maximum(
-            np.sum(across_base * across_base, axis=-1), 1e-18
-        )
-        normal = np.cross(turned, self._base)
-        length = np.linalg.norm(normal, axis=-1)
-        near = np.abs(np.sum(normal * rays, axis=-1)) < self._threshold * length
-        possible = (inverse_depth > self._least_inverse_depth) & (inverse_depth < self._max_inverse_depth)
-        return rays, inverse_depth, near & possible
+        # What is not found is given any place where the camera model holds.
+        return np.where(found[:, None], pixels, start), found
