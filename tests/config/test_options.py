@@ -10,9 +10,11 @@ from vioframe.build import build, build_pipeline, resolve_class
 from vioframe.data.recording import Dataset
 from vioframe.errors import ConfigError
 from vioframe.evaluation.rows import evaluate_run
+from vioframe.interfaces import STEREO_TRACKS
 from vioframe.pipeline import SLOTS
 from vioframe.tasks.run_sequence import run_sequence
 
+LOOPS = [("loop", name) for name in offered("loop") if name != "none"]
 PARTS = [(slot, name) for slot in SLOTS for name in offered(slot) if name != "none"]
 
 
@@ -33,12 +35,13 @@ def test_part_builds_from_its_yaml(slot, name):
 
 @pytest.mark.parametrize(
     ("group", "name"),
-    [*PARTS, *(("dataset", name) for name in offered("dataset")), *(("tracker", name) for name in offered("tracker")), ("faults", "default")],
+    [*PARTS, *LOOPS, *(("dataset", name) for name in offered("dataset")), *(("tracker", name) for name in offered("tracker")), ("faults", "default")],
     ids=lambda value: str(value),
 )
 def test_every_constructor_argument_is_in_the_yaml_and_nothing_else(group, name):
     """So that Hydra refuses a misspelt option, and a reader finds every choice."""
-    config = composed(f"{group}={name}")
+    # The group loop= exists only with a fuser that has a place for it.
+    config = composed(f"{group}={name}", *(["fuser=window"] if group == "loop" else []))
     found = list(targets(config[group], group))
     assert found
     for key, node in found:
@@ -78,6 +81,26 @@ def test_what_the_user_writes_wins_over_what_a_part_brings():
 def test_a_part_brings_the_partners_without_which_it_is_meaningless():
     assert composed("fuser=ekf").rig.cameras == 2
     assert composed("fuser=imu_only").rig.images is False
+
+
+@pytest.mark.parametrize("fuser", ["msckf", "window"])
+def test_one_word_takes_a_tightly_coupled_system_from_one_camera_to_two(fuser):
+    for rig, stereo in (("mono", False), ("stereo", True)):
+        config = composed(f"fuser={fuser}", f"rig={rig}")
+        assert not config.vo
+        assert (config.fuser.stereo, config.frontend.stereo) == (stereo, stereo)
+        features = {STEREO_TRACKS} if stereo else set()
+        pipeline = build_pipeline(config, {})
+        assert features <= pipeline.fuser.requires and features <= pipeline.frontend.provides
+    assert composed(f"fuser={fuser}", "rig=stereo", "fuser.stereo=false").frontend.stereo is False
+    assert composed("fuser=ekf").frontend.stereo is False, "a VO that matches by itself needs no points in camera 1"
+
+
+def test_presets_close_loops_unless_told_otherwise():
+    assert "_target_" in composed("system=vins_mono").fuser.loop
+    assert not composed("system=vins_mono", "loop=none").fuser.loop
+    assert not composed("fuser=window").fuser.loop
+    assert composed("system=vins_stereo").rig.cameras == 2
 
 
 def test_unknown_fuser_options_are_refused_by_hydra():
