@@ -156,6 +156,9 @@ class AslDataset(PartedDataset):
         if (self.root / "imu0").is_dir():
             return [self.root.parent.name if self.root.name == "mav0" else self.root.name]
         found = sequences_under(self.root)
+        for folder in (self.root, self.root / "mav0"):
+            if not found and (folder / "cam0").is_dir():
+                raise DataError(f"{folder / 'imu0'}: no such folder: without inertial samples there is nothing to run")
         if not found:
             raise DataError(
                 f"{self.root}: no sequence here (folders with mav0/imu0 are expected): set dataset.root to the folder "

@@ -39,7 +39,8 @@ def read_frame_list(folder: Path, *, images: bool) -> tuple[Stamps, list[Path], 
     """
     listing, bare = folder / "data.csv", folder / "timestamps.txt"
     if not folder.is_dir():
-        raise DataError(f"{folder}: no such folder; it should hold the images of this camera: check the recording")
+        advice = "complete the recording" + (", or use one camera (rig=mono)" if folder.name != "cam0" else "")
+        raise DataError(f"{folder}: no such folder; it should hold the images of this camera: {advice}")
     if not listing.exists() and not bare.exists():
         raise DataError(f"{listing}: no such file, and no {bare.name} beside it; it should list the images")
     source = listing if listing.exists() else bare

@@ -173,9 +173,12 @@ class KittiDataset(FolderDataset):
         paths = [[image_folder / name for name in names] for image_folder in self._image_folders(folder)]
         usable = find_images(paths)
         if usable.sum() < 2:
+            # The camera that lacks most is the one to name.
+            emptiest = min(paths, key=lambda files: int(find_images([files]).sum()))
+            advice = "use one camera (rig=mono), or set" if len(paths) > 1 else "or set"
             raise DataError(
-                f"{paths[0][0].parent}: has images of {int(usable.sum())} of {count} frames: fetch them, or set "
-                "dataset.images=false to run on the stamps alone"
+                f"{emptiest[0].parent}: has images of {int(find_images([emptiest]).sum())} of {count} frames: fetch "
+                f"them, {advice} dataset.images=false to run on the stamps alone"
             )
         there = np.flatnonzero(usable)
         missing = int(there[-1] - there[0] + 1 - len(there))

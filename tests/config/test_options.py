@@ -35,7 +35,13 @@ def test_part_builds_from_its_yaml(slot, name):
 
 @pytest.mark.parametrize(
     ("group", "name"),
-    [*PARTS, *LOOPS, *(("dataset", name) for name in offered("dataset")), *(("tracker", name) for name in offered("tracker")), ("faults", "default")],
+    [
+        *PARTS,
+        *LOOPS,
+        *(("dataset", name) for name in offered("dataset")),
+        *(("tracker", name) for name in offered("tracker")),
+        ("faults", "default"),
+    ],
     ids=lambda value: str(value),
 )
 def test_every_constructor_argument_is_in_the_yaml_and_nothing_else(group, name):

@@ -149,7 +149,7 @@ class _Experiment:
                 log.error("%s", error)
                 self._take(_unopened(recording.name, str(error)), None)
                 return False
-        if stop is not None:
+        if run.error is not None:
             log.error("%s: %s", recording.name, run.error)
         if stop is not None and not isinstance(stop, VioframeError | KeyboardInterrupt):
             self._bug = stop

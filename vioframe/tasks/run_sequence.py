@@ -167,7 +167,7 @@ def run_sequence(
         init=init,
         uses_ground_truth=users,
         faults=recording.faults(),
-        error=_say(stop, recorder.windows, expected),
+        error=_say(stop, recorder.windows, expected) if stop or pipeline.windows else _nothing_ran(init),
         interrupted=isinstance(stop, KeyboardInterrupt),
     )
     return run, recorder, stop
@@ -187,6 +187,13 @@ def _say(stop: BaseException | None, done: int, expected: int) -> str | None:
     if isinstance(stop, VioframeError):
         return str(stop)
     return f"{type(stop).__name__}: {stop}"
+
+
+def _nothing_ran(init: str) -> str:
+    """Why a recording that came to its end gave not one window."""
+    if init == "groundtruth":
+        return "init=groundtruth, but the ground truth has no pose at any image: use init=rest"
+    return "no image could be paired with inertial samples, so nothing was estimated: check that both clocks overlap"
 
 
 def initial_state(init: str, truth: Trajectory | None, sequence: str) -> InitialState | None:
