@@ -24,7 +24,7 @@ GRAVITY_SIGN = "gravity upside down"
 GRAVITY = "gravity"
 SCALE = "uncertain scale"
 POOR_FIT = "poor fit"
-TOO_SHORT = "too short"
+UNCONFIRMED = "unconfirmed"
 
 
 @dataclass(slots=True)

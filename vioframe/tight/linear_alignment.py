@@ -99,7 +99,7 @@ def solve_path(views: Views) -> Path:
         distance = np.linalg.norm(from_view, axis=-1)
         typical = float(np.nanmedian(distance)) if np.isfinite(distance).any() else 1.0
         # Relative to the scene, so that a small scene is no cheaper than a large one.
-        depth = np.clip(np.nan_to_num(distance / typical, nan=1.0), 0.2, 10.0)
+        depth = np.clip(np.nan_to_num(distance / max(typical, 1e-9), nan=1.0), 0.2, 10.0)
     way = np.einsum("vmi,vmi->vm", from_view, views.direction) * views.seen
     along = way.sum(axis=0)[np.isfinite(points).all(axis=1)]
     ahead = float(np.mean(along > 0.0)) if len(along) else 0.0

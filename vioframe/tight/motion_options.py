@@ -22,7 +22,8 @@ class MotionStartOptions:
             the accelerometer bias told from a tilt.
         min_accel: m/s², scatter of the acceleration; without it one camera knows no scale.
         min_parallax_deg: degrees by which the points move apart from the rotation.
-        max_scale_sigma: ratio, standard deviation of the scale.
+        max_scale_sigma: ratio, standard deviation of the scale by the stated noise.
+        max_scale_change: ratio, difference of the scale from the one that the attempt before found.
         widen: factor on the standard deviations of the first state, since the estimator goes through the same
             measurements again.
     """
@@ -32,13 +33,14 @@ class MotionStartOptions:
     every_s: float = 0.25
     pixel_sigma: float = 0.5
     inertial_noise_scale: float = 3.0
-    accel_bias_sigma: float = 0.15
+    accel_bias_sigma: float = 0.2
     min_points: int = 20
     min_turn_deg: float = 2.0
     min_accel: float = 0.1
     min_parallax_deg: float = 1.0
-    max_scale_sigma: float = 0.04
-    widen: float = 3.0
+    max_scale_sigma: float = 0.03
+    max_scale_change: float = 0.04
+    widen: float = 5.0
 
     def __post_init__(self) -> None:
         for each in fields(self):

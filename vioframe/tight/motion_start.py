@@ -29,6 +29,7 @@ from vioframe.tight.motion_options import MotionStartOptions
 from vioframe.tight.motion_window import MotionWindow, Sight
 from vioframe.tight.options import CalibrationOptions
 from vioframe.tight.rotation_agreement import compare_rotations
+from vioframe.tight.solved_path import SolvedPath
 from vioframe.tight.start_bundle import BundlePriors, BundleResult, Sightings, WindowState, refine
 from vioframe.tight.step import Start
 from vioframe.tight.two_view_rotation import relative_rotations
@@ -69,10 +70,12 @@ class MotionStart:
         self._noise = options.noise(rig.imu)
         self._sigma = options.pixel_sigma / float(rig.cameras[0].intrinsics_px[0])
         self._tried_ns: int | None = None
+        self._before: SolvedPath | None = None
 
     def clear(self) -> None:
         """Forget what was seen."""
         self._window.clear()
+        self._before = None
 
     def push(self, measurement: Measurement) -> tuple[Start | None, InitialisationAttempt | None]:
         """Take the next window; return a start if there is one, and the record of an attempt if one was made."""
@@ -85,6 +88,8 @@ class MotionStart:
         self._tried_ns = stamp_ns
         examination = Examination()
         start = self._attempt(examination)
+        if examination.fault and "scale sigma" not in examination.measures:
+            self._before = None
         return start, examination.record(stamp_ns, "motion")
 
     def _attempt(self, examination: Examination) -> Start | None:
@@ -176,7 +181,29 @@ class MotionStart:
         sightings = _sightings(geometry, self._sigma, np.isfinite(path.points.sum(axis=1)))
         result = refine(start, sightings, between, rates, priors)
         self._check_bundle(examination, result)
+        if result is not None:
+            self._check_confirmed(examination, SolvedPath.of(result, self._window.origin_ns, times))
         return None if examination.fault else result
+
+    def _check_confirmed(self, examination: Examination, solved: SolvedPath) -> None:
+        """A scale is believed when the attempt before found it too: stated sigmas do not know of all errors."""
+        before, self._before = self._before, solved
+        if examination.fault:
+            return
+        change = None if before is None else solved.size_against(before)
+        if change is None:
+            examination.blame(doctor.UNCONFIRMED, "one attempt more must find the same scale")
+            return
+        limit = self._options.max_scale_change
+        examination.at_most(
+            "scale change",
+            abs(change - 1.0),
+            limit,
+            "",
+            doctor.SCALE,
+            f"the scale changed by {abs(change - 1.0):.0%} since the attempt before (limit {limit:.0%}): accelerate "
+            "more, sideways and up and down",
+        )
 
     def _align(self, geometry: _Geometry, R: Array, P: Array, D: Array) -> tuple[Path, Alignment]:
         sight = geometry.sight
