@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 
+from vioframe.evaluation.attempts import attempts_section, start_text
 from vioframe.evaluation.protocol import EvaluationOptions, describe_association
 from vioframe.evaluation.rows import Row, metrics_document
 from vioframe.evaluation.run import SequenceRun
@@ -204,6 +205,9 @@ def _sequence_section(row: Row, figures: Mapping[str, Path], *, anchor: str, hea
     html = [f"<section id={anchor}>"]
     if heading:
         html.append(f"<h2>{escape(str(row['sequence']))}</h2>")
+    started = start_text(row)
+    if started:
+        html.append(f"<p class=counters>{escape(started)}</p>")
     counted = counter_text(row)
     if counted:
         html.append(f"<p class=counters>{escape(counted)}</p>")
@@ -213,6 +217,7 @@ def _sequence_section(row: Row, figures: Mapping[str, Path], *, anchor: str, hea
             html.append(f"<p class=note>Undefined: {escape(join(labels))} ({escape(reason)}).</p>")
         html.append(f"<p class=note>{escape(protocol_text(row))}</p>")
     html += [_image(title, path) for title, path in figures.items()]
+    html.append(attempts_section(row))
     return "\n".join([*html, "</section>"])
 
 
@@ -300,6 +305,9 @@ td.failed, td.interrupted { color: #b3202c; font-weight: 600; }
 .parts { color: #555; margin: 0 0 1rem; }
 .failure { background: #fdecec; border-left: 4px solid #b3202c; padding: .5rem .8rem; }
 .counters { background: #fff6e0; border-left: 4px solid #d9a441; padding: .4rem .8rem; }
+h3 { font-size: 1.05rem; margin: 1.6rem 0 .3rem; }
+li.bad { color: #b3202c; font-weight: 600; }
+details ul { margin: .2rem 0; padding-left: 1.1rem; }
 .note { color: #777; font-size: .86rem; margin: .3rem 0; }
 img { width: 100%; display: block; margin: 1.2rem 0; }
 img.large { width: 76%; margin: 1rem auto; }

@@ -12,6 +12,7 @@ from vioframe.conventions import NANOSECONDS
 from vioframe.errors import MetricError
 from vioframe.evaluation import metrics
 from vioframe.evaluation.align import Alignment, MatchedPoses, align, associate, path_length
+from vioframe.evaluation.attempts import attempt_entries
 from vioframe.evaluation.protocol import EvaluationOptions, Output, Protocol, describe_options
 from vioframe.evaluation.run import SequenceRun
 from vioframe.evaluation.states import StateColumns
@@ -90,6 +91,7 @@ def evaluate_run(run: SequenceRun, options: EvaluationOptions | None = None) -> 
         "duration_s": run.duration_s,
         "pipeline_s": run.pipeline_s,
         "wall_s": run.wall_s,
+        "initialisation": attempt_entries(run.attempts, _origin_ns(run)),
         "counters": {name: int(count) for name, count in run.counters.items()},
         "undefined": cells.undefined,
         "protocol": make_protocol(run, options, "causal", states.stamps_ns).as_dict(),
@@ -103,6 +105,13 @@ def evaluate_run(run: SequenceRun, options: EvaluationOptions | None = None) -> 
             "protocol": make_protocol(run, options, "final", run.smoothed.stamps_ns).as_dict(),
         }
     return row
+
+
+def _origin_ns(run: SequenceRun) -> int:
+    """Where the run began: its first image, or the first attempt to start where no points were counted."""
+    if len(run.track_stamps_ns):
+        return int(run.track_stamps_ns[0])
+    return run.attempts[0].stamp_ns if run.attempts else 0
 
 
 def make_protocol(run: SequenceRun, options: EvaluationOptions, output: Output, stamps_ns: Stamps) -> Protocol:

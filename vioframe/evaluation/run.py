@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from vioframe.checks import Array, Stamps, check_array
-from vioframe.types import Image, NavState, Trajectory
+from vioframe.types import Image, InitialisationAttempt, NavState, Trajectory
 
 RunStatus = Literal["finished", "failed", "interrupted"]
 
@@ -52,6 +52,7 @@ class SequenceRun:
         track_stamps_ns: (K,) IMU clock, when points were counted; empty without a front end.
         track_counts: (K,) number of points followed.
         sample_frames: a few images for the report.
+        attempts: to start, oldest first.
         init: how the fuser was started, ``"rest"`` or ``"groundtruth"``.
         uses_ground_truth: names of the parts that simulate a sensor from the truth.
         faults: what was spoilt on purpose in the recording.
@@ -73,6 +74,7 @@ class SequenceRun:
     track_stamps_ns: Stamps = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     track_counts: Stamps = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     sample_frames: Sequence[SampleFrame] = ()
+    attempts: Sequence[InitialisationAttempt] = ()
     init: str = "rest"
     uses_ground_truth: tuple[str, ...] = ()
     faults: tuple[str, ...] = ()

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vioframe.evaluation.attempts import start_text
 from vioframe.evaluation.rows import Row
 from vioframe.evaluation.wording import (
     UNDEFINED,
@@ -175,6 +176,9 @@ def _notes(row: Row, *, name: bool) -> "list[RenderableType]":
     notes: list[RenderableType] = []
     if row.get("error"):
         notes.append(Text(prefix + failure_text(row), style="bold red"))
+    started = start_text(row)
+    if started:
+        notes.append(Text(f"{prefix}{started}", style="yellow"))
     counted = counter_text(row)
     if counted:
         notes.append(Text(f"{prefix}{counted}", style="yellow"))

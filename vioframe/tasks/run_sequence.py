@@ -164,6 +164,7 @@ def run_sequence(
         track_stamps_ns=np.array(recorder.track_stamps_ns, dtype=np.int64),
         track_counts=np.array(recorder.track_counts, dtype=np.int64),
         sample_frames=recorder.samples,
+        attempts=tuple(pipeline.fuser.attempts()),
         init=init,
         uses_ground_truth=users,
         faults=recording.faults(),

@@ -52,6 +52,7 @@ REST = [
     "duration_s",
     "pipeline_s",
     "wall_s",
+    "initialisation",
     "counters",
     "undefined",
     "protocol",
