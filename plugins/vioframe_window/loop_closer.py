@@ -91,6 +91,7 @@ class BowLoop(LoopCloser):
         self._trajectory = KeyframeTrajectory(self._graph, None if given is None else given.T_map_body)
         self._counts: dict[str, int] = {}
         self._interrupted = False
+        self._refinable: set[int] = set()
         self._pending: tuple[int, float, Array] | None = None
         if given is not None:
             for node, (stamp_ns, seen) in enumerate(zip(given.stamps_ns.tolist(), given.appearances, strict=True)):
@@ -122,8 +123,9 @@ class BowLoop(LoopCloser):
         self._recent.settle(stamps_ns, T_world_body)
 
     def refine(self, match_id: int, T_world_loop: Array, T_world_body: Array) -> None:
-        """Take a better relative pose of a match."""
-        self._ready().refine(match_id, se3.inverse(T_world_loop) @ T_world_body)
+        """Take a better relative pose of a match; it passes where most points of the match were not the smoother's."""
+        if match_id in self._refinable:
+            self._ready().refine(match_id, se3.inverse(T_world_loop) @ T_world_body)
 
     def interrupt(self) -> None:
         """The smoother started again: the step from the last keyframe to the next is not to be trusted."""
@@ -257,7 +259,11 @@ class BowLoop(LoopCloser):
 
     def _is_confirmed(self, stamp_ns: int, yaw: float, offset: Array, position: Array) -> bool:
         """Whether the last match with the loaded map said the same about where this sequence lies in it."""
-        pending, self._pending = self._pending, (stamp_ns, yaw, offset)
+        pending = self._pending
+        if pending is not None and pending[0] == stamp_ns:
+            # Its neighbours in the map say the same of the same image: that is no second opinion.
+            return False
+        self._pending = stamp_ns, yaw, offset
         if pending is None or stamp_ns - pending[0] > _AGREE_WITHIN_NS:
             return False
         apart = (so3.rotation_z(yaw) - so3.rotation_z(pending[1])) @ position + offset - pending[2]
@@ -275,6 +281,8 @@ class BowLoop(LoopCloser):
         self._count("loop closures")
         held = np.isin(ids[found.points], keyframe.landmark_ids)
         points, corners = found.points[held], found.corners[held]
+        if 2 * len(points) > len(found.points):
+            self._refinable.add(number)
         return LoopMatch(
             match_id=number,
             stamp_ns=keyframe.stamp_ns,

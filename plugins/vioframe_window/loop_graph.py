@@ -105,21 +105,21 @@ def _turn_back(yaw: Array, vectors: Array) -> Array:
     return np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=1)
 
 
-def odometry_edges(T_world_body: Array, broken: np.ndarray, options: GraphOptions) -> Edges:
+def odometry_edges(T_world_body: Array, order: np.ndarray, broken: np.ndarray, options: GraphOptions) -> Edges:
     """Steps from every node to the ``neighbours`` before it.
 
     Args:
         T_world_body: (N, 4, 4) of the odometry.
+        order: (N,) increasing numbers that count steps; some may be missing.
         broken: (N,) whether the step to this node is one that the odometry did not measure.
         options: sigmas.
     """
     count = len(T_world_body)
     ends = np.concatenate([np.arange(k, count) for k in range(1, options.neighbours + 1)])
-    spans = np.concatenate([np.full(max(count - k, 0), k) for k in range(1, options.neighbours + 1)])
-    starts = ends - spans
+    starts = np.concatenate([np.arange(max(count - k, 0)) for k in range(1, options.neighbours + 1)])
     position = T_world_body[:, :3, 3]
     displacement = position[ends] - position[starts]
-    root_span = np.sqrt(spans)
+    root_span = np.sqrt(order[ends] - order[starts])
     sigma_m = options.step_sigma_m * root_span + options.step_sigma_share * np.linalg.norm(displacement, axis=1)
     sigma_yaw = np.radians(options.step_sigma_yaw_deg) * root_span
     breaks = np.cumsum(broken)

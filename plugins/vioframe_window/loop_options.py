@@ -136,12 +136,12 @@ class GraphOptions:
     """
 
     neighbours: int = 4
-    step_sigma_m: float = 0.005
-    step_sigma_share: float = 0.02
-    step_sigma_yaw_deg: float = 0.1
+    step_sigma_m: float = 0.01
+    step_sigma_share: float = 0.05
+    step_sigma_yaw_deg: float = 0.2
     match_sigma_m: float = 0.05
     match_sigma_yaw_deg: float = 0.5
-    huber: float = 1.5
+    huber: float = 5.0
     interrupted: float = 20.0
     iterations: int = 5
     solve_above: float = 1.0

@@ -38,6 +38,8 @@ class KeyframeTrajectory:
         self._yaw: Array = np.zeros(self.first)
         self._offset: Array = np.zeros((self.first, 3))
         self._broken = np.zeros(self.first, dtype=bool)
+        self._order = np.zeros(self.first, dtype=np.int64)
+        self._added = 0
         self._matches: dict[int, Match] = {}
         self._next_match = 0
         self._stale = False
@@ -70,6 +72,8 @@ class KeyframeTrajectory:
         self._yaw = np.concatenate([self._yaw, T_map_world[0]])
         self._offset = np.concatenate([self._offset, T_map_world[1]])
         self._broken = np.append(self._broken, broken)
+        self._order = np.append(self._order, self._added)
+        self._added += 1
         return len(self) - 1
 
     def settle(self, stamps_ns: Stamps, T_world_body: Array) -> None:
@@ -130,7 +134,8 @@ class KeyframeTrajectory:
         self._stale = False
         matches = list(self._matches.values())
         earliest = min(match.start for match in matches)
-        edges = graph.odometry_edges(self.T_world_body[self.first :], self._broken[self.first :], self._options)
+        own = slice(self.first, None)
+        edges = graph.odometry_edges(self.T_world_body[own], self._order[own], self._broken[own], self._options)
         edges = graph.Edges.join(edges.shifted(self.first), self._match_edges(matches))
         fixed = np.arange(len(self)) < self.first
         if earliest >= self.first:
@@ -173,7 +178,7 @@ class KeyframeTrajectory:
         self._broken = np.diff(breaks, prepend=0) > 0
         self.first = int(kept[: self.first].sum())
         self.stamps_ns, self.T_world_body = self.stamps_ns[kept], self.T_world_body[kept]
-        self._yaw, self._offset = self._yaw[kept], self._offset[kept]
+        self._yaw, self._offset, self._order = self._yaw[kept], self._offset[kept], self._order[kept]
         self._matches = {
             key: Match(start=int(number[m.start]), end=int(number[m.end]), T_start_end=m.T_start_end)
             for key, m in self._matches.items()
