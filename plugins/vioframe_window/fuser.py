@@ -15,15 +15,18 @@ from vioframe.tight.options import CalibrationOptions, FailureOptions, InertialT
 from vioframe.tight.start import TightStartOptions
 from vioframe.tight.step import Start, Step, Support
 from vioframe.types import Measurement, NavState, SensorRig, Trajectory
-from vioframe_window.keyframes import Keyframe, View, focal_length
+from vioframe_window.keyframes import Keyframe, Turn, View, focal_length
 from vioframe_window.library import require_gtsam
 from vioframe_window.loop_interface import LoopCloser
 from vioframe_window.options import LandmarkOptions, WindowOptions
-from vioframe_window.triangulation import NewPoints, find_new_points, reprojection_errors
+from vioframe_window.triangulation import Doubts, NewPoints, find_new_points, reprojection_errors
+from vioframe_window.turning import find_turn
 
 # With fewer points than this in view, what may enter is judged by a wider gate.
 _FEW = 20
 _SLACK = 3.0
+# Points out of sight stay until the lag has passed; with those in view they are at most so many times the wanted.
+_HELD_IN_ALL = 2
 # A point of the window may be this much further off, in a predicted view, than a new one in the views it has.
 _TRACKED = 2.0
 
@@ -76,6 +79,7 @@ class WindowFuser(TightFuser):
         self._landmarks = landmarks or LandmarkOptions()
         if loop and not isinstance(loop, LoopCloser):
             raise ConfigError(f"fuser.loop must be a loop closer, such as loop=bow, or none; got {loop!r}")
+        self._rest_limit = self._standstill.gate()
         self._loop = loop or None
         self._loop_corrects_states = loop_corrects_states
 
@@ -187,7 +191,11 @@ class WindowFuser(TightFuser):
         if self._is_keyframe(views[0]):
             return self._add_keyframe(step, views)
         agrees = self._known(views[0], self._camera_poses()[0])[1]
-        return Support(used=int(agrees.sum()), points=len(self._smoother.point_ids), at_rest=step.at_rest)
+        used = int(agrees.sum())
+        if used < _FEW:
+            turn = self._turn(views[0])
+            used = max(used, 0 if turn is None else turn.agreeing)
+        return Support(used=used, points=len(self._smoother.point_ids), at_rest=step.at_rest)
 
     def _estimate(self) -> NavState:
         return self._filter.nav_state(self._now_ns, "tracking")
@@ -195,6 +203,11 @@ class WindowFuser(TightFuser):
     def _continue(self) -> None:
         """Go on from the newest keyframe."""
         newest = self._smoother.newest
+        covariance = self._smoother.covariance
+        if not self._smoother.has_covariance:
+            # That of the inertial samples since; an image takes only a little off it.
+            predicted = self._estimate().covariance
+            covariance = covariance if predicted is None else predicted
         self._now_ns = newest.stamp_ns
         self._rested = True
         self._filter.start(
@@ -204,9 +217,23 @@ class WindowFuser(TightFuser):
                 v_world_body=newest.v_world_body,
                 bias=newest.bias,
             ),
-            self._smoother.covariance,
+            covariance,
         )
+        # For the gate of a standstill: has it moved since?
+        self._filter.clone_pose()
         self._samples.begin(newest.bias)
+
+    def _fits_standstill(self) -> bool:
+        """Whether the inertial samples since the last keyframe allow that there was no motion.
+
+        A standstill is told by the last half second; this tells its end.
+        """
+        options = self._standstill
+        H, residual, noise = self._filter.standstill_measurement(
+            options.rotation_sigma, options.position_sigma, options.velocity_sigma
+        )
+        _, distance = self._filter.innovation(H, residual, noise)
+        return distance <= self._rest_limit
 
     def _is_keyframe(self, view: View) -> bool:
         newest = self._smoother.newest
@@ -233,6 +260,17 @@ class WindowFuser(TightFuser):
         limit = (_SLACK if len(rows) < _FEW else 1.0) * _TRACKED * self._landmarks.max_error_px / self._focal_px
         return rows, (errors < limit) & (depths > self._landmarks.min_depth)
 
+    def _turn(self, view: View) -> Turn | None:
+        """How camera 0 has turned since the last keyframe, if that is all that its points show.
+
+        Without parallax no point can enter the window; a body that stands or turns on the spot is not lost for
+        that, and its turn shows the bias of the gyro.
+        """
+        newest = self._smoother.newest
+        if not newest.views:
+            return None
+        return find_turn(newest.views[0], view, np.radians(self._landmarks.min_parallax_deg))
+
     def _add_keyframe(self, step: Step, views: tuple[View, ...]) -> Support:
         smoother, body = self._smoother, self._filter.body
         keyframe = Keyframe(
@@ -240,7 +278,7 @@ class WindowFuser(TightFuser):
             stamp_ns=step.stamp_ns,
             views=views,
             increment=self._samples.take(),
-            at_rest=self._rested,
+            at_rest=self._rested and self._fits_standstill(),
             delay_s=seconds(step.window.camera_delay_ns),
             rate=step.window.imu.gyro[-1],
             T_world_body=body.T_world_body,
@@ -256,6 +294,8 @@ class WindowFuser(TightFuser):
             observed[camera] = rows[agrees]
             refused += int((~agrees).sum())
         held = len(observed[0])
+        keyframe.turn = self._turn(views[0]) if held < _FEW else None
+        far = 0 if keyframe.turn is None else keyframe.turn.agreeing
         new = self._find_new(keyframe, held)
         self._settle()
         if not smoother.add(keyframe, observed, new.ids, new.points_world):
@@ -264,7 +304,7 @@ class WindowFuser(TightFuser):
         if self._relocalisation is not None and step.window.current.images:
             self._relocalisation.take_keyframe(step.window.current.images[0], step.tracks)
         return Support(
-            used=sum(len(rows) for rows in observed.values()) + len(new.ids),
+            used=max(sum(len(rows) for rows in observed.values()) + len(new.ids), far),
             refused=refused + new.refused,
             points=len(smoother.point_ids),
             at_rest=step.at_rest,
@@ -273,18 +313,30 @@ class WindowFuser(TightFuser):
     def _find_new(self, keyframe: Keyframe, held: int) -> NewPoints:
         """Points of the newest keyframe to take in, in front of all cameras that saw them."""
         smoother = self._smoother
-        keyframes = [*smoother.keyframes, keyframe]
-        T_world_cam = np.concatenate([smoother.camera_poses(k.T_world_cam)[: len(k.views)] for k in keyframes])
+        covariance = self._filter.nav_state(self._now_ns, "tracking").covariance
+        sigmas = np.zeros(15) if covariance is None else np.sqrt(np.diag(covariance))
+        cameras = [
+            (T_world_cam, view, seconds(past.stamp_ns - keyframe.stamp_ns))
+            for past in (*smoother.keyframes, keyframe)
+            for T_world_cam, view in zip(smoother.camera_poses(past.T_world_cam), past.views, strict=False)
+        ]
         ids = keyframe.views[0].ids
-        ids = ids[~np.isin(ids, smoother.point_ids)]
         return find_new_points(
-            T_world_cam,
-            [view for k in keyframes for view in k.views],
-            ids,
+            np.stack([camera[0] for camera in cameras]),
+            [camera[1] for camera in cameras],
+            ids[~np.isin(ids, smoother.point_ids)],
             self._landmarks,
-            most=min(self._landmarks.most - len(smoother.point_ids), self._landmarks.most_new),
+            most=min(
+                self._landmarks.most - held,
+                _HELD_IN_ALL * self._landmarks.most - len(smoother.point_ids),
+                self._landmarks.most_new,
+            ),
             focal_px=self._focal_px,
             slack=_SLACK if held < _FEW else 1.0,
+            doubts=Doubts(
+                times_s=np.array([camera[2] for camera in cameras]),
+                rate_sigma=float(sigmas[9:12].max()),
+            ),
         )
 
     def _settle(self) -> None:

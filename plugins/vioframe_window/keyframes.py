@@ -46,6 +46,21 @@ class View:
         return rows, self.ids[rows] == ids
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Turn:
+    """What two views of points without parallax say: how camera 0 has turned, and nothing else.
+
+    Attributes:
+        R_past_cam: (3, 3) from the newer camera into the older.
+        sigma: rad an axis.
+        agreeing: points that moved as the turn says.
+    """
+
+    R_past_cam: Array
+    sigma: float
+    agreeing: int
+
+
 @dataclass(slots=True, kw_only=True, eq=False)
 class Keyframe:
     """One keyframe of the window; its estimates are refreshed after every solution.
@@ -57,6 +72,7 @@ class Keyframe:
         increment: gtsam's preintegrated samples since the keyframe before, None at the first.
         at_rest: the body has not moved since the keyframe before.
         delay_s: camera delay that the stamp contains.
+        turn: since the keyframe before, where there are too few points in the window to tell it.
         rate: (3,) rad/s, of the gyro at the stamp, bias included.
         T_world_body: (4, 4); v_world_body: (3,); bias...
         T_world_cam: (4, 4) of camera 0.
@@ -72,6 +88,7 @@ class Keyframe:
     T_world_body: Array
     v_world_body: Array
     bias: ImuBias
+    turn: Turn | None = None
     T_world_cam: Array = field(default_factory=lambda: np.eye(4))
 
 

@@ -22,13 +22,16 @@ class WindowOptions:
             keyframe before its time; 0 for never.
         iterations: Gauss–Newton steps after a keyframe.
         relinearise_above: change of a variable (rad, m, …) above which its factors are linearised again.
+        covariance_every: keyframes from one computation of the covariance to the next; those between carry it on by
+            the inertial samples.
     """
 
     lag_s: float = 3.0
     keyframe_s: float = 0.2
     sparse_below: float = 0.5
     iterations: int = 1
-    relinearise_above: float = 0.02
+    relinearise_above: float = 0.005
+    covariance_every: int = 2
 
     def __post_init__(self) -> None:
         _check_positive(
@@ -40,8 +43,9 @@ class WindowOptions:
             )
         if not 0.0 <= self.sparse_below < 1.0:
             raise ConfigError(f"fuser.window.sparse_below must be in [0, 1), got {self.sparse_below}")
-        if self.iterations < 1:
-            raise ConfigError(f"fuser.window.iterations must be at least 1, got {self.iterations}")
+        for name in ("iterations", "covariance_every"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"fuser.window.{name} must be at least 1, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,7 +71,7 @@ class LandmarkOptions:
     max_error_px: float = 3.0
     min_depth: float = 0.2
     max_depth: float = 60.0
-    sigma_px: float = 0.7
+    sigma_px: float = 0.5
     huber: float = 1.345
 
     def __post_init__(self) -> None:

@@ -29,6 +29,8 @@ log = logging.getLogger(__name__)
 
 # Observations are normalised coordinates, so that any lens is a pinhole of focal length 1.
 _CALIBRATION = gtsam.Cal3_S2()
+# Sigma, m, of the part of a relative pose that was not measured.
+_NO_MEASUREMENT = 1e3
 # Fewer points do not say where an old image was taken.
 _FEWEST_SEEN_AGAIN = 6
 
@@ -87,6 +89,11 @@ class Smoother:
         return self.keyframes[-1]
 
     @property
+    def has_covariance(self) -> bool:
+        """Whether :attr:`covariance` is that of the newest keyframe, or of one a little before."""
+        return self._since_covariance == 0
+
+    @property
     def T_body_cam(self) -> Array:
         """Camera 0 on the body, (4, 4), as estimated now."""
         return self._calibration.T_body_cam
@@ -117,6 +124,7 @@ class Smoother:
         self.loop_cameras: dict[int, Array] = {}
         self._waiting = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self.covariance = covariance
+        self._since_covariance = 0
         self._origin_ns = keyframe.stamp_ns
         self._open(state, covariance)
 
@@ -187,14 +195,18 @@ class Smoother:
         now = self._time(self.newest.stamp_ns)
         stamps: dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex] = dict.fromkeys(values.keys(), now)
         stamps.update(dict.fromkeys([factors.point_key(track_id) for track_id in seen.tolist()], now))
-        if self._calibration.is_estimated:
-            stamps[factors.EXTRINSICS] = now
-            if self._calibration.delay_sigma is not None:
-                stamps[factors.DELAY] = now
+        stamps.update(self._kept_alive())
         self._solver.update(graph, values, stamps)
         for _ in range(self._window.iterations - 1):
             self._solver.update()
         self._read()
+
+    def _kept_alive(self) -> dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex]:
+        """Stamps of the variables that never leave the window."""
+        if not self._calibration.is_estimated:
+            return {}
+        keys = [factors.EXTRINSICS, *([] if self._calibration.delay_sigma is None else [factors.DELAY])]
+        return dict.fromkeys(keys, self._time(self.newest.stamp_ns))
 
     def _read(self) -> None:
         """Refresh every estimate; forget what was marginalised."""
@@ -226,7 +238,10 @@ class Smoother:
             for match_id in self.loop_cameras
             if values.exists(factors.loop_key(match_id))
         }
-        self.covariance = self._marginal()
+        self._since_covariance += 1
+        if self._since_covariance >= self._window.covariance_every:
+            self.covariance = self._marginal()
+            self._since_covariance = 0
 
     def _marginal(self) -> Array:
         """Covariance (15, 15) of the newest keyframe, in the order of ``NavState.covariance``."""
@@ -280,7 +295,7 @@ class Smoother:
         for sound in (self._sound_points(), np.zeros(0, dtype=np.int64)):
             try:
                 self._rebuild(sound)
-            except RuntimeError as error:
+            except (RuntimeError, ValueError) as error:
                 log.debug("the window could not be built again with %d points: %s", len(sound), error)
             else:
                 return
@@ -311,6 +326,7 @@ class Smoother:
             stamps[factors.point_key(track_id)] = self._time(stamp_ns)
             for keyframe in self.keyframes:
                 self._observe_if_seen(graph, keyframe, track_id)
+        stamps.update(self._kept_alive())
         self._solver.update(graph, values, stamps)
         self._solve(gtsam.NonlinearFactorGraph(), gtsam.Values(), self.point_ids[:0])
 
@@ -346,6 +362,12 @@ class Smoother:
                 gtsam.BetweenFactorPose3(factors.body_key(i), factors.body_key(j), gtsam.Pose3(), self._no_motion)
             )
             graph.push_back(gtsam.PriorFactorVector(factors.velocity_key(j), np.zeros(3), self._no_speed))
+        if keyframe.turn is not None:
+            R_body_cam = self.T_body_cam[:3, :3]
+            turned = gtsam.Pose3(se3.from_parts(R_body_cam @ keyframe.turn.R_past_cam @ R_body_cam.T, np.zeros(3)))
+            sigmas = np.repeat([keyframe.turn.sigma, _NO_MEASUREMENT], 3)
+            noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+            graph.push_back(gtsam.BetweenFactorPose3(factors.body_key(i), factors.body_key(j), turned, noise))
         if self._calibration.is_estimated:
             self._tie(graph, keyframe)
 

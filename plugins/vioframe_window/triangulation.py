@@ -11,6 +11,9 @@ from vioframe.geometry.triangulation import triangulate
 from vioframe_window.keyframes import View
 from vioframe_window.options import LandmarkOptions
 
+# Sigmas of the turn between two views above which their parallax is believed.
+_SURE_TURN = 3.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NewPoints:
@@ -38,6 +41,19 @@ def gather(views: Sequence[View], ids: Stamps) -> tuple[Array, Mask]:
     return bearings, seen
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Doubts:
+    """How far the attitudes of views may be off relative to each other.
+
+    Attributes:
+        times_s: (V,) of the views.
+        rate_sigma: rad/s, by which the turn from one view to another may be off, a second between them.
+    """
+
+    times_s: Array
+    rate_sigma: float
+
+
 def find_new_points(
     T_world_cam: Array,
     views: Sequence[View],
@@ -47,6 +63,7 @@ def find_new_points(
     most: int,
     focal_px: float,
     slack: float,
+    doubts: Doubts | None = None,
 ) -> NewPoints:
     """Triangulate tracks and keep those that are sure enough.
 
@@ -58,11 +75,12 @@ def find_new_points(
         most: as many may enter.
         focal_px: pixels a unit of normalised coordinates.
         slack: factor on the reprojection gate.
+        doubts: of the poses; None where they are sure.
     """
     bearings, seen = gather(views, ids)
     enough = np.flatnonzero(seen.sum(axis=0) >= options.min_views)
     bearings, seen = bearings[:, enough], seen[:, enough]
-    parallax = _parallax(np.einsum("vij,vnj->vni", T_world_cam[:, :3, :3], bearings), seen)
+    parallax = _sure_parallax(T_world_cam, bearings, seen, doubts)
     wide = parallax > np.radians(options.min_parallax_deg)
     enough, bearings, seen, parallax = enough[wide], bearings[:, wide], seen[:, wide], parallax[wide]
     if not len(enough):
@@ -89,12 +107,18 @@ def reprojection_errors(T_world_cam: Array, points_world: Array, bearings: Array
     return errors
 
 
-def _parallax(rays: Array, seen: Mask) -> Array:
-    """Largest angle (N,) rad between the ray of a point's last view and its others; rays (V, N, 3)."""
-    count = len(rays)
-    last = count - 1 - np.argmax(seen[::-1], axis=0)
+def _sure_parallax(T_world_cam: Array, bearings: Array, seen: Mask, doubts: Doubts | None) -> Array:
+    """Largest angle (N,) rad between the ray of a point's last view and its others, as far as it is no error.
+
+    A gyro whose bias is not known yet turns all rays, and points would enter close by that are far: an angle below a
+    few sigmas of what such a bias makes of the time between two views does not count.
+    """
+    rays = np.einsum("vij,vnj->vni", T_world_cam[:, :3, :3], bearings)
+    last = len(rays) - 1 - np.argmax(seen[::-1], axis=0)
     newest = rays[last, np.arange(rays.shape[1])]
-    cosines = np.einsum("vni,ni->vn", rays, newest)
-    lowest = np.where(seen, cosines, 1.0).min(axis=0)
-    angles: Array = np.arccos(np.clip(lowest, -1.0, 1.0))
-    return angles
+    angles = np.arccos(np.clip(np.einsum("vni,ni->vn", rays, newest), -1.0, 1.0))
+    if doubts is not None:
+        elapsed = doubts.times_s[last] - doubts.times_s[:, None]
+        seen = seen & (angles > _SURE_TURN * doubts.rate_sigma * elapsed)
+    largest: Array = np.where(seen, angles, 0.0).max(axis=0)
+    return largest
