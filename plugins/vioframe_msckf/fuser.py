@@ -34,6 +34,7 @@ class MsckfFuser(TightFuser):
 
     Args:
         points: how image points are used.
+        stereo: True needs the points in camera 1 too, False leaves them out, None takes what the front end gives.
         inertial: trust in the inertial increments.
         calibration: what of the calibration is estimated.
         standstill: measuring no motion at rest.
@@ -45,6 +46,7 @@ class MsckfFuser(TightFuser):
         self,
         *,
         points: PointOptions | None = None,
+        stereo: bool | None = None,
         inertial: InertialTrust | None = None,
         calibration: CalibrationOptions | None = None,
         standstill: StandstillOptions | None = None,
@@ -52,7 +54,12 @@ class MsckfFuser(TightFuser):
         failure: FailureOptions | None = None,
     ) -> None:
         super().__init__(
-            inertial=inertial, calibration=calibration, standstill=standstill, start=start, failure=failure
+            stereo=stereo,
+            inertial=inertial,
+            calibration=calibration,
+            standstill=standstill,
+            start=start,
+            failure=failure,
         )
         self._points = points or PointOptions()
 
@@ -65,11 +72,19 @@ class MsckfFuser(TightFuser):
         most = 2 * len(cameras) * (self._points.clones + 1)
         self._limits = np.array([0.0] + [chi_square_limit(0.95, degrees) for degrees in range(1, most + 1)])
 
+    def T_body_cam(self) -> Array:
+        """Place of camera 0 on the body, (4, 4), as estimated now."""
+        return self._state.T_body_cam if self._ready and self._running else super().T_body_cam()
+
     def camera_delay_ns(self) -> int | None:
         """The estimated delay, approached in small steps; None where it is not estimated."""
         if not self._ready or not self._running or not self._calibration.time_offset:
             return None
         return self._told_delay_ns
+
+    def T_body_cam(self) -> Array:
+        """Place of camera 0 on the body, (4, 4), as estimated now; as calibrated before the start."""
+        return self._state.T_body_cam.copy() if self._ready and self._running else super().T_body_cam()
 
     def _begin(self, start: Start) -> None:
         calibration = self._calibration
@@ -165,7 +180,7 @@ class MsckfFuser(TightFuser):
                     R=np.broadcast_to(R[-1], (len(index), 3, 3)),
                     p=np.broadcast_to(p[-1], (len(index), 3)),
                     measured=measured[here],
-                    weights=weights[here],
+                    weights=weights[here] * (self._points.sigma_px / self._points.landmark_sigma_px),
                 )
             )
         used = refused = 0
@@ -242,6 +257,13 @@ class MsckfFuser(TightFuser):
             return 0, 0
         rows, found, points, weights = rows[good], found[good], points[good], weights[good]
         tracks = linearise(R, p, found, points, weights)
+        ray = found - p_all[anchors[good]]
+        distance2 = (ray * ray).sum(axis=1)
+        sure = ((ray[:, None] @ tracks.G)[:, 0] * ray).sum(axis=1) < (options.max_depth_ratio * distance2) ** 2
+        good[good] = sure
+        if not sure.any():
+            return 0, 0
+        rows, weights, tracks = rows[sure], weights[sure], tracks.pick(sure)
         limits = options.track_gate * self._limits[(tracks.rows - 3).astype(np.int64)]
         fits = tracks.squares <= limits
         columns = state.clone_errors

@@ -173,7 +173,7 @@ class FilterState:
             noise: (N, 3, 3).
         """
         count = 3 * len(ids)
-        J = J.reshape(count, -1)
+        J = J.reshape(count, len(self.covariance))
         size = len(self.covariance)
         grown = np.empty((size + count, size + count))
         grown[:size, :size] = self.covariance
