@@ -28,6 +28,12 @@ _AGREES_SHARE = 0.3
 _AGREES_RATE = 0.05
 # An explanation must leave less than this share of the residual that it explains.
 _EXPLAINS = 0.5
+_CLEARLY_LESS = 0.8
+# Below this residual, rad/s, there is nothing to explain.
+_NOISE_RATE = 0.02
+# A delay up to this is found and followed; a camera that is turned by less is refined.
+_MOST_DELAY_S = 0.08
+_LEAST_ANGLE_DEG = 10.0
 _STILL_DEG = 0.2
 
 
@@ -188,40 +194,47 @@ def check_rotations(
         return
     limit = max(_AGREES_SHARE * agreement.turning, _AGREES_RATE)
     residual = agreement.residual_rotated if find else agreement.residual
-    if examination.hold("gyro against camera", residual, limit, "rad/s", good=residual <= limit):
-        return
-    explanations = [
-        (
-            agreement.residual_delayed_rotated if find else agreement.residual_delayed,
-            doctor.TIME_OFFSET,
-            f"gyro and camera agree if the camera's stamps are moved by {1e3 * agreement.delay_s:+.0f} ms: set "
-            "rig.camera_delay_ns, or let the driver stamp the middle of the exposure",
-        ),
-        (
-            agreement.residual_mirrored,
-            doctor.SWAPPED_AXES,
-            "gyro and camera agree only if an axis is mirrored: two axes of the inertial sensor are swapped, or one "
-            "has the wrong sign",
-        ),
-    ]
-    if not find:
-        explanations.append(
-            (
-                agreement.residual_rotated,
-                doctor.WRONG_EXTRINSICS,
-                f"gyro and camera agree only if the camera is turned by {apart:.0f}° on the body: check "
-                "T_body_cam, or use fuser.calibration.extrinsics=find",
-            )
-        )
-    best = min(explanations, key=lambda each: each[0])
-    if best[0] < _EXPLAINS * residual:
-        examination.blame(best[1], best[2])
-    else:
+    fault, sentence = _explanation(agreement, residual, apart, find=find)
+    agrees = residual <= limit and not fault
+    examination.hold("gyro against camera", residual, limit, "rad/s", good=agrees)
+    if fault:
+        examination.blame(fault, sentence)
+    elif not agrees:
         examination.blame(
             doctor.DISAGREEMENT,
             f"gyro and camera turn differently by {residual:.2g} rad/s (limit {limit:.2g}), which neither a delay nor "
             "a rotation explains: check the calibration, or wait for better tracks",
         )
+
+
+def _explanation(agreement: Agreement, residual: float, apart_deg: float, *, find: bool) -> tuple[str, str]:
+    """Fault and sentence of what explains most of the residual; empty where nothing does, or nothing has to."""
+    if residual < _NOISE_RATE:
+        return "", ""
+    delayed = agreement.residual_delayed_rotated if find else agreement.residual_delayed
+    explanations = []
+    if abs(agreement.delay_s) > _MOST_DELAY_S:
+        sentence = (
+            f"gyro and camera agree if the camera's stamps are moved by {1e3 * agreement.delay_s:+.0f} ms: set the "
+            "recording's camera_delay_s, or let the driver stamp the middle of the exposure"
+        )
+        explanations.append((delayed, doctor.TIME_OFFSET, sentence))
+    # Where the body turns about two axes only, a rotation explains whatever a mirror does.
+    mirrored = agreement.residual_mirrored
+    if mirrored < _CLEARLY_LESS * agreement.residual_rotated:
+        sentence = (
+            "gyro and camera agree only if an axis is mirrored: two axes of the inertial sensor are swapped, or one "
+            "has the wrong sign"
+        )
+        explanations.append((mirrored, doctor.SWAPPED_AXES, sentence))
+    if not find and apart_deg > _LEAST_ANGLE_DEG:
+        sentence = (
+            f"gyro and camera agree only if the camera is turned by {apart_deg:.0f}° on the body: check T_body_cam, "
+            "or use fuser.calibration.extrinsics=find"
+        )
+        explanations.append((agreement.residual_rotated, doctor.WRONG_EXTRINSICS, sentence))
+    left, fault, sentence = min(explanations, default=(np.inf, "", ""))
+    return (fault, sentence) if left < _EXPLAINS * residual else ("", "")
 
 
 def check_excitation(

@@ -6,18 +6,15 @@ a small bundle adjustment refines all of it and says how certain it is. A state 
 than one that starts late, so everything is examined before it is believed.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from vioframe.checks import Array, Mask
-from vioframe.geometry import se3, so3
-from vioframe.inertial import level
+from vioframe.checks import Array
+from vioframe.geometry import se3
 from vioframe.tight import doctor
 from vioframe.tight.doctor import Examination
-from vioframe.tight.gyro_bias import PairedPoints, RotationFit, fit_rotations
+from vioframe.tight.gyro_bias import RotationFit, fit_rotations
 from vioframe.tight.inertial_window import InertialWindow
-from vioframe.tight.linear_alignment import Alignment, Path, Views, align, solve_path
+from vioframe.tight.linear_alignment import Alignment, Path, align, solve_path
 from vioframe.tight.motion_checks import (
     check_excitation,
     check_inertial,
@@ -25,32 +22,34 @@ from vioframe.tight.motion_checks import (
     check_rotations,
     check_standstill,
 )
+from vioframe.tight.motion_geometry import (
+    Geometry,
+    keyframes,
+    moved,
+    paired,
+    sightings_of,
+    spaced,
+    turn_deg,
+    views_of,
+    window_state,
+)
 from vioframe.tight.motion_options import MotionStartOptions
 from vioframe.tight.motion_window import MotionWindow, Sight
 from vioframe.tight.options import CalibrationOptions
-from vioframe.tight.rotation_agreement import compare_rotations
+from vioframe.tight.rotation_agreement import Agreement, compare_rotations
 from vioframe.tight.solved_path import SolvedPath
-from vioframe.tight.start_bundle import BundlePriors, BundleResult, Sightings, WindowState, refine
+from vioframe.tight.start_bundle import BundlePriors, BundleResult, WindowState, refine
 from vioframe.tight.step import Start
 from vioframe.tight.two_view_rotation import relative_rotations
 from vioframe.types import ImuBias, InitialisationAttempt, Measurement, NavState, SensorRig
 
 _IMAGE_SPACING_S = 0.1
 _PAIR_S = 0.4
-_KEY_SPACING_S = 0.22
-_MOST_KEYS = 14
-_MOST_POINTS = 90
-_PAIR_POINTS = 70
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Geometry:
-    """The keyframes with their rotations: what the linear and the bundled solution share."""
-
-    sight: Sight
-    fit: RotationFit
-    T_body_cams: tuple[Array, ...]
-    inertial: InertialWindow
+# A delay is moved to where the rotations fit if it is this clear; else it is refined with everything.
+_DELAY_SIGMAS = 3.0
+_LEAST_DELAY_S = 0.008
+_DELAY_EXPLAINS = 0.7
+_MOST_ROTATION_SIGMA_DEG = 1.0
 
 
 class MotionStart:
@@ -95,22 +94,37 @@ class MotionStart:
     def _attempt(self, examination: Examination) -> Start | None:
         examination.note("seconds", self._window.span_s, "s")
         inertial, sight = self._window.inertial(), self._window.sight()
-        images = _spaced(sight.times, _IMAGE_SPACING_S)
+        images = spaced(sight.times, _IMAGE_SPACING_S)
         sight = sight.at(images)
         check_inertial(examination, inertial, self._rig.imu)
         check_points(examination, sight, self._options)
         check_standstill(examination, inertial, sight, self._rig)
         if examination.fault:
             return None
-        fit = self._fit_rotations(examination, inertial, sight)
-        if fit is None:
+        agreement = self._compare_rotations(examination, inertial, sight)
+        if examination.fault:
             return None
+        delay_s = self._believed_delay_s(agreement)
+        sight = moved(sight, delay_s, inertial)
+        fit = self._fit_rotations(inertial, sight, agreement)
+        examination.note("gyro bias", float(np.linalg.norm(fit.gyro_bias)), "rad/s")
         metric = len(self._rig.cameras) > 1 and int(sight.seen_stereo.sum()) > self._options.min_points
+        if self._finds_rotation:
+            sigma_deg = float(np.degrees(fit.rotation_sigma))
+            examination.at_most(
+                "camera rotation sigma",
+                sigma_deg,
+                _MOST_ROTATION_SIGMA_DEG,
+                "°",
+                doctor.NO_ROTATION,
+                f"the camera's rotation on the body is only known to {sigma_deg:.1f}° "
+                f"(limit {_MOST_ROTATION_SIGMA_DEG:g}°): turn the body about two axes",
+            )
         check_excitation(examination, inertial, sight, fit, self._options, metric=metric)
         if examination.fault:
             return None
-        geometry = _Geometry(
-            sight=_keyframes(sight),
+        geometry = Geometry(
+            sight=keyframes(sight),
             fit=fit,
             T_body_cams=self._cameras(fit.R_body_cam)[: 1 + metric],
             inertial=inertial,
@@ -118,12 +132,13 @@ class MotionStart:
         result = self._solve(examination, geometry)
         if result is None:
             return None
-        found = self._calibration.extrinsics == "find"
+        found = self._finds_rotation
         return Start(
-            state=self._state(result),
+            state=self._state(result, inertial, float(geometry.sight.times[0])),
             method="motion",
             T_body_cam=geometry.T_body_cams[0] if found else None,
-            rotation_sigma=max(self._options.widen * fit.rotation_sigma, 2e-3) if found else 0.0,
+            rotation_sigma=max(2.0 * fit.rotation_sigma, 2e-3) if found else 0.0,
+            delay_s=delay_s + result.state.delay_s,
             replay=self._window.after_origin,
         )
 
@@ -134,28 +149,40 @@ class MotionStart:
         T_first[:3, :3] = R_body_cam
         return tuple(T_first @ np.linalg.inv(calibrated[0]) @ T for T in calibrated)
 
-    def _fit_rotations(self, examination: Examination, inertial: InertialWindow, sight: Sight) -> RotationFit | None:
-        """Gyro bias and the camera's rotation, or None where they contradict the calibration."""
+    def _compare_rotations(self, examination: Examination, inertial: InertialWindow, sight: Sight) -> Agreement:
+        """Hold the gyro against the rotations between successive images."""
         calibrated = self._rig.cameras[0].T_body_cam[:3, :3]
-        find = self._calibration.extrinsics == "find"
-        pairs = _paired(sight, 1, self._sigma)
+        pairs = paired(sight, 1, self._sigma)
         R_start, R_end = inertial.rotations(pairs.starts, np.zeros(3)), inertial.rotations(pairs.ends, np.zeros(3))
         predicted = calibrated.T @ R_start.swapaxes(-1, -2) @ R_end @ calibrated
         still = np.tile(np.eye(3), (len(predicted), 1, 1))
         seen = relative_rotations(pairs.first, pairs.second, pairs.common, (still, predicted), self._sigma)
         agreement = compare_rotations(inertial, pairs.starts, pairs.ends, seen, calibrated)
-        check_rotations(examination, agreement, _turn_deg(seen.R), calibrated, self._options, find=find)
-        if examination.fault:
-            return None
-        known = agreement.R_body_cam if find else calibrated
-        sigma = 0.5 if find else self._calibration.rotation_sigma
-        stride = max(round(_PAIR_S / float(np.median(pairs.ends - pairs.starts))), 1)
-        wide = _paired(sight, min(stride, len(sight.times) - 1), self._sigma)
-        fit = fit_rotations(inertial, wide, known, agreement.gyro_bias, sigma)
-        examination.note("gyro bias", float(np.linalg.norm(fit.gyro_bias)), "rad/s")
-        return fit
+        turned = turn_deg(seen.R)
+        check_rotations(examination, agreement, turned, calibrated, self._options, find=self._finds_rotation)
+        return agreement
 
-    def _solve(self, examination: Examination, geometry: _Geometry) -> BundleResult | None:
+    @property
+    def _finds_rotation(self) -> bool:
+        return self._calibration.extrinsics == "find"
+
+    def _believed_delay_s(self, agreement: Agreement) -> float:
+        """A delay that the rotations show clearly; what is smaller is left to the bundle adjustment."""
+        clear = max(_DELAY_SIGMAS * agreement.delay_sigma_s, _LEAST_DELAY_S)
+        better = agreement.residual_delayed < _DELAY_EXPLAINS * agreement.residual
+        believed = self._calibration.time_offset and not self._finds_rotation and better
+        return agreement.delay_s if believed and abs(agreement.delay_s) > clear else 0.0
+
+    def _fit_rotations(self, inertial: InertialWindow, sight: Sight, agreement: Agreement) -> RotationFit:
+        """Gyro bias and the camera's rotation, from pairs of images farther apart."""
+        stride = max(round(_PAIR_S / float(np.median(np.diff(sight.times)))), 1)
+        pairs = paired(sight, min(stride, len(sight.times) - 1), self._sigma)
+        if self._finds_rotation:
+            return fit_rotations(inertial, pairs, agreement.R_body_cam, agreement.gyro_bias_rotated, 0.5)
+        calibrated = self._rig.cameras[0].T_body_cam[:3, :3]
+        return fit_rotations(inertial, pairs, calibrated, agreement.gyro_bias, self._calibration.rotation_sigma)
+
+    def _solve(self, examination: Examination, geometry: Geometry) -> BundleResult | None:
         """Linear solution, then the bundle adjustment; None where one of them is not believed."""
         sight, fit = geometry.sight, geometry.fit
         times = sight.times
@@ -169,7 +196,7 @@ class MotionStart:
         self._check_linear(examination, path, alignment)
         if examination.fault:
             return None
-        start = _window_state(path, alignment, geometry, R, whole.delta_v, fit.gyro_bias)
+        start = window_state(path, alignment, geometry, R, whole.delta_v, fit.gyro_bias)
         between = geometry.inertial.increments(times[:-1], times[1:], start.bias, self._noise)
         rates = np.stack([np.interp(times, geometry.inertial.elapsed, w) for w in geometry.inertial.gyro.T], axis=1)
         priors = BundlePriors(
@@ -178,7 +205,7 @@ class MotionStart:
             accel_bias_sigma=self._options.accel_bias_sigma,
             delay_sigma_s=self._calibration.time_offset_sigma_s if self._calibration.time_offset else 1e-6,
         )
-        sightings = _sightings(geometry, self._sigma, np.isfinite(path.points.sum(axis=1)))
+        sightings = sightings_of(geometry, self._sigma, np.isfinite(path.points.sum(axis=1)))
         result = refine(start, sightings, between, rates, priors)
         self._check_bundle(examination, result)
         if result is not None:
@@ -205,25 +232,11 @@ class MotionStart:
             "more, sideways and up and down",
         )
 
-    def _align(self, geometry: _Geometry, R: Array, P: Array, D: Array) -> tuple[Path, Alignment]:
+    def _align(self, geometry: Geometry, R: Array, P: Array, D: Array) -> tuple[Path, Alignment]:
         sight = geometry.sight
-        directions, seen, levers, instants = [], [], [], []
-        sources = [(sight.bearings, sight.seen), (sight.stereo, sight.seen_stereo)]
-        metric = len(geometry.T_body_cams) > 1
-        for (bearings, mask), T_body_cam in zip(sources[: 1 + metric], geometry.T_body_cams, strict=False):
-            directions.append(bearings @ T_body_cam[:3, :3].T @ R.swapaxes(-1, -2))
-            seen.append(mask)
-            levers.append(R @ T_body_cam[:3, 3])
-            instants.append(np.arange(len(R)))
-        views = Views(
-            instants=np.concatenate(instants),
-            direction=np.concatenate(directions),
-            seen=np.concatenate(seen),
-            lever=np.concatenate(levers),
-            metric=metric,
-        )
+        views = views_of(geometry, R)
         path = solve_path(views)
-        lever = np.zeros((len(R), 3)) if metric else levers[0] - levers[0][0]
+        lever = np.zeros((len(R), 3)) if views.metric else views.lever - views.lever[0]
         alignment = align(
             path,
             sight.times - sight.times[0],
@@ -304,8 +317,10 @@ class MotionStart:
             "more, sideways and up and down",
         )
 
-    def _state(self, result: BundleResult) -> NavState:
+    def _state(self, result: BundleResult, inertial: InertialWindow, first_s: float) -> NavState:
+        """The state at the stamp of the window's oldest image, from that at the first instant."""
         state = result.state
+        T_world_body, velocity = self._at_origin(state, inertial, first_s)
         last = len(result.covariance)
         order = np.concatenate([np.arange(9), np.arange(last - 7, last - 1)])
         covariance = result.covariance[np.ix_(order, order)]
@@ -315,102 +330,25 @@ class MotionStart:
         floor = np.repeat([2e-3, 1e-3, 0.02, 1e-3, 0.02], 3)
         return NavState(
             stamp_ns=self._window.origin_ns,
-            T_world_body=se3.from_parts(state.R[0], state.p[0]),
-            v_world_body=state.v[0],
+            T_world_body=T_world_body,
+            v_world_body=velocity,
             bias=state.bias,
             covariance=covariance + np.diag(floor**2),
         )
 
-
-def _spaced(times: Array, spacing_s: float) -> Array:
-    """Indices of times about ``spacing_s`` apart, the first and the last included."""
-    count = max(round((times[-1] - times[0]) / spacing_s) + 1, 2)
-    wanted = np.linspace(times[0], times[-1], count)
-    return np.unique(np.abs(times[None] - wanted[:, None]).argmin(axis=1))
-
-
-def _turn_deg(R_prev_cur: Array) -> float:
-    """Largest angle, degrees, between the first image and another, from the rotations between successive ones."""
-    R, largest = np.eye(3), 0.0
-    for turn in R_prev_cur:
-        R = R @ turn
-        largest = max(largest, float(so3.angle(R)))
-    return float(np.degrees(largest))
-
-
-def _paired(sight: Sight, stride: int, sigma: float) -> PairedPoints:
-    """Pairs of images ``stride`` apart, with up to ``_PAIR_POINTS`` points in common."""
-    first, second = np.arange(len(sight.times) - stride), np.arange(stride, len(sight.times))
-    both = sight.seen[first] & sight.seen[second]
-    most = int(np.clip(both.sum(axis=1).max(), 1, _PAIR_POINTS))
-    at = np.argsort(~both, axis=1, kind="stable")[:, :most]
-    return PairedPoints(
-        starts=sight.times[first],
-        ends=sight.times[second],
-        first=np.take_along_axis(sight.bearings[first], at[..., None], axis=1),
-        second=np.take_along_axis(sight.bearings[second], at[..., None], axis=1),
-        common=np.take_along_axis(both, at, axis=1),
-        sigma=sigma,
-    )
-
-
-def _keyframes(sight: Sight) -> Sight:
-    """Fewer images, and the points that most of them see."""
-    spacing = max(_KEY_SPACING_S, float(sight.times[-1] - sight.times[0]) / (_MOST_KEYS - 1))
-    keys = sight.at(_spaced(sight.times, spacing))
-    count = keys.seen.sum(axis=0)
-    points = np.argsort(-count, kind="stable")[:_MOST_POINTS]
-    return keys.of(points[count[points] >= 3])
-
-
-def _window_state(
-    path: Path, alignment: Alignment, geometry: _Geometry, R: Array, delta_v: Array, gyro_bias: Array
-) -> WindowState:
-    """The linear solution in a world whose z axis is up, as unknowns of the bundle adjustment."""
-    sight = geometry.sight
-    times = (sight.times - sight.times[0])[:, None]
-    R_world_first = level(-alignment.gravity)
-    lever = geometry.T_body_cams[0][:3, 3]
-    scale = 1.0 if path.metric else alignment.scale
-    moved = 0.0 if path.metric else R @ lever - lever
-    places = scale * path.places - moved
-    velocity = alignment.velocity + alignment.gravity * times + np.concatenate([np.zeros((1, 3)), delta_v])
-    # Points in the frame of the first view, whose origin is the camera, or the body where the path is metric.
-    origin = 0.0 if path.metric else lever
-    points = scale * path.points + origin
-    anchor = np.argmax(sight.seen, axis=0)
-    centres = places + R @ lever
-    distance = np.linalg.norm(points - centres[anchor], axis=1)
-    return WindowState(
-        R=R_world_first @ R,
-        p=places @ R_world_first.T,
-        v=velocity @ R_world_first.T,
-        bias=ImuBias(gyro=gyro_bias, accel=alignment.accel_bias),
-        delay_s=0.0,
-        inverse_depth=1.0 / np.clip(np.nan_to_num(distance, nan=10.0), 0.2, 400.0),
-    )
-
-
-def _sightings(geometry: _Geometry, sigma: float, usable: Mask) -> Sightings:
-    sight = geometry.sight
-    K = len(sight.times)
-    anchor = np.argmax(sight.seen, axis=0)
-    seen = sight.seen & usable
-    seen[anchor, np.arange(len(anchor))] = False
-    view, point = np.nonzero(seen)
-    view_right, point_right = np.nonzero(sight.seen_stereo & usable)
-    cams = geometry.T_body_cams
-    T = np.concatenate([np.tile(cams[0], (K, 1, 1)), np.tile(cams[-1], (K, 1, 1))])
-    if len(cams) == 1:
-        view_right, point_right = view_right[:0], point_right[:0]
-    return Sightings(
-        point=np.concatenate([point, point_right]),
-        view=np.concatenate([view, view_right + K]),
-        anchor=anchor,
-        ray=np.concatenate([sight.bearings[view, point], sight.stereo[view_right, point_right]]),
-        anchor_ray=sight.bearings[anchor, np.arange(len(anchor))],
-        instant=np.tile(np.arange(K), 2),
-        R_body_cam=T[:, :3, :3],
-        p_body_cam=T[:, :3, 3],
-        sigma=sigma,
-    )
+    def _at_origin(self, state: WindowState, inertial: InertialWindow, first_s: float) -> tuple[Array, Array]:
+        """T_world_body (4, 4) and velocity (3,) at the window's origin, ``first_s`` before the first instant."""
+        R, p, v = state.R[0], state.p[0], state.v[0]
+        if abs(first_s) < 1e-6:
+            return se3.from_parts(R, p), v
+        start, end = np.array([min(first_s, 0.0)]), np.array([max(first_s, 0.0)])
+        step = inertial.increments(start, end, state.bias, self._noise)
+        down, T = np.array([0.0, 0.0, -self._rig.gravity]), abs(first_s)
+        if first_s < 0.0:
+            return (
+                se3.from_parts(R @ step.delta_R[0], p + v * T + 0.5 * down * T**2 + R @ step.delta_p[0]),
+                v + down * T + R @ step.delta_v[0],
+            )
+        R = R @ step.delta_R[0].T
+        v = v - down * T - R @ step.delta_v[0]
+        return se3.from_parts(R, p - v * T - 0.5 * down * T**2 - R @ step.delta_p[0]), v

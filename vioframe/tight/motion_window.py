@@ -29,7 +29,7 @@ class Sight:
     stereo: Array
     seen_stereo: Mask
 
-    def of(self, points: Array) -> "Sight":
+    def of(self, points: Stamps) -> "Sight":
         """These points (indices) only."""
         return replace(
             self,
@@ -39,7 +39,7 @@ class Sight:
             seen_stereo=self.seen_stereo[:, points],
         )
 
-    def at(self, images: Array) -> "Sight":
+    def at(self, images: Stamps) -> "Sight":
         """These images (indices) only."""
         return Sight(
             times=self.times[images],

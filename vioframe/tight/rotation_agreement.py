@@ -31,7 +31,8 @@ class Agreement:
     """How gyro and camera agree over a window; residuals are rms over the pairs, rad/s.
 
     Attributes:
-        gyro_bias: (3,) rad/s, with the rotation that was used and no delay.
+        gyro_bias: (3,) rad/s, with the calibrated rotation and no delay.
+        gyro_bias_rotated: (3,) rad/s, with ``R_body_cam``.
         turning: rad/s, rms of the camera's rate apart from a constant.
         residual: with the calibration as it is.
         R_body_cam: (3, 3) that fits best without a delay.
@@ -45,6 +46,7 @@ class Agreement:
     """
 
     gyro_bias: Array
+    gyro_bias_rotated: Array
     turning: float
     residual: float
     R_body_cam: Array
@@ -93,6 +95,7 @@ def compare_rotations(
     delay, delay_sigma = _parabola(delays, calibrated**2, best, int(inside[best].sum()))
     return Agreement(
         gyro_bias=_rate(psi[zero] - phi @ R_body_cam.T, T, weight[zero]),
+        gyro_bias_rotated=_rate(psi[zero] - phi @ rotations[zero].T, T, weight[zero]),
         turning=float(_rms(phi_free[zero], T, weight[zero])),
         residual=float(calibrated[zero]),
         R_body_cam=rotations[zero],
