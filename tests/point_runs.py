@@ -163,5 +163,3 @@ def play_points(
                 sync.assume_camera_delay(delay_ns)
                 run.delays_ns.append(delay_ns)
     return run
-
-

@@ -82,10 +82,6 @@ class MsckfFuser(TightFuser):
             return None
         return self._told_delay_ns
 
-    def T_body_cam(self) -> Array:
-        """Place of camera 0 on the body, (4, 4), as estimated now; as calibrated before the start."""
-        return self._state.T_body_cam.copy() if self._ready and self._running else super().T_body_cam()
-
     def _begin(self, start: Start) -> None:
         calibration = self._calibration
         self._state = FilterState(self._noise, self._rig.gravity)
@@ -105,7 +101,8 @@ class MsckfFuser(TightFuser):
             T_body_cam,
             np.diag(sigmas**2),
         )
-        self._state.delay_s = self._told_delay_s = self._rig.camera_delay_ns / NANOSECONDS
+        known_s = self._rig.camera_delay_ns / NANOSECONDS
+        self._state.delay_s = self._told_delay_s = known_s if start.camera_delay_s is None else start.camera_delay_s
         self._table = TrackTable(len(self._noise_of), self._points.clones + 1)
         self._misses: dict[int, int] = {}
         self._newest: NavState | None = None

@@ -17,6 +17,9 @@ import numpy as np
 from vioframe.checks import Array, Mask
 from vioframe.geometry import so3
 
+# Added to the points' information, relative to it, so that it has an inverse.
+_RIDGE = 1e-12
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Linearised:
@@ -100,7 +103,10 @@ def linearise(R: Array, p: Array, found: Array, points: Array, weights: Array) -
     flat = residual.transpose(0, 2, 1, 3).reshape(count, clones, -1)
     W = (stacked[..., :, None] * stacked[..., None, :]).sum(axis=2)
     b = (stacked * flat[..., None]).sum(axis=2)
-    G = np.linalg.inv(W.sum(axis=1))
+    total = W.sum(axis=1)
+    # Rays without any parallax have no depth; its uncertainty then tells so.
+    total[:, (0, 1, 2), (0, 1, 2)] += _RIDGE * np.trace(total, axis1=1, axis2=2)[:, None]
+    G = np.linalg.inv(total)
     A = np.concatenate([so3.hat(found), np.broadcast_to(-np.eye(3), (count, 3, 3))], axis=-1)
     return Linearised(
         found=found,

@@ -39,7 +39,7 @@ def triangulate(R: Array, p: Array, points: Array, weights: Array, anchors: Stam
     R_anchor, p_anchor = R[anchors], p[anchors]
     local = ((first - p_anchor)[:, None, :] @ R_anchor)[:, 0]
     row = np.arange(count)
-    ahead = local[:, 2] > 1e-3
+    ahead = np.asarray(local[:, 2] > 1e-3)
     depth = np.where(ahead, local[:, 2], 1.0)
     x = np.empty((count, 3))
     x[:, :2] = np.where(ahead[:, None], local[:, :2] / depth[:, None], points[row, anchors])
@@ -86,7 +86,8 @@ def widest_parallax(R: Array, points: Array, weights: Array, anchors: Stamps) ->
     reference = rays[np.arange(len(points)), anchors]
     cosines = (rays * reference[:, None]).sum(axis=-1)
     smallest = np.where(weights > 0.0, cosines, 1.0).min(axis=1)
-    return np.arccos(np.clip(smallest, -1.0, 1.0))
+    widest: Array = np.arccos(np.clip(smallest, -1.0, 1.0))
+    return widest
 
 
 def in_front(R: Array, p: Array, found: Array, weights: Array, min_depth_m: float, max_depth_m: float) -> Mask:
