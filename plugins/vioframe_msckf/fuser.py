@@ -68,6 +68,7 @@ class MsckfFuser(TightFuser):
         super().setup(rig)
         cameras = rig.cameras[:2]
         self._noise_of = [PixelNoise(camera, self._points.sigma_px) for camera in cameras]
+        self._told_delay_s = rig.camera_delay_ns / NANOSECONDS
         self._T_cam_others = [se3.inverse(cameras[0].T_body_cam) @ camera.T_body_cam for camera in cameras]
         most = 2 * len(cameras) * (self._points.clones + 1)
         self._limits = np.array([0.0] + [chi_square_limit(0.95, degrees) for degrees in range(1, most + 1)])
@@ -101,8 +102,7 @@ class MsckfFuser(TightFuser):
             T_body_cam,
             np.diag(sigmas**2),
         )
-        known_s = self._rig.camera_delay_ns / NANOSECONDS
-        self._state.delay_s = self._told_delay_s = known_s if start.camera_delay_s is None else start.camera_delay_s
+        self._state.delay_s = self._told_delay_s if start.camera_delay_s is None else start.camera_delay_s
         self._table = TrackTable(len(self._noise_of), self._points.clones + 1)
         self._misses: dict[int, int] = {}
         self._newest: NavState | None = None

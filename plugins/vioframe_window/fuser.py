@@ -154,7 +154,7 @@ class WindowFuser(TightFuser):
             rotation_sigma = position_sigma = 0.0
         elif found:
             rotation_sigma = max(start.rotation_sigma, 1e-3)
-        delay_s = seconds(self._rig.camera_delay_ns)
+        delay_s = seconds(self._rig.camera_delay_ns) if start.camera_delay_s is None else start.camera_delay_s
         state = start.state
         covariance = 1e-6 * np.eye(15) if state.covariance is None else state.covariance
         first = Keyframe(

@@ -9,6 +9,7 @@ than one that starts late, so everything is examined before it is believed.
 import numpy as np
 
 from vioframe.checks import Array
+from vioframe.conventions import seconds
 from vioframe.geometry import se3
 from vioframe.tight import doctor
 from vioframe.tight.doctor import Examination
@@ -132,14 +133,14 @@ class MotionStart:
         result = self._solve(examination, geometry)
         if result is None:
             return None
-        found = self._finds_rotation
+        found, replay = self._finds_rotation, self._window.after_origin
         return Start(
             state=self._state(result, inertial, float(geometry.sight.times[0])),
             method="motion",
             T_body_cam=geometry.T_body_cams[0] if found else None,
             rotation_sigma=max(2.0 * fit.rotation_sigma, 2e-3) if found else 0.0,
-            delay_s=delay_s + result.state.delay_s,
-            replay=self._window.after_origin,
+            camera_delay_s=seconds(replay[0].window.camera_delay_ns) + delay_s + result.state.delay_s,
+            replay=replay,
         )
 
     def _cameras(self, R_body_cam: Array) -> tuple[Array, ...]:

@@ -78,11 +78,12 @@ class Starter:
     def push(self, measurement: Measurement) -> Start | None:
         """Take the next window; return where to begin, or None as long as something is missing."""
         stamp_ns = measurement.window.current.stamp_ns
+        delay_s = seconds(measurement.window.camera_delay_ns)
         if self._given is not None:
             state, self._given = self._given, None
             self._record(InitialisationAttempt(stamp_ns=stamp_ns, method="given", succeeded=True))
             state = replace(state, covariance=self._options.covariance_of(state))
-            return Start(state=state, method="given", replay=(measurement,))
+            return Start(state=state, method="given", camera_delay_s=delay_s, replay=(measurement,))
         if self._first_ns is None:
             self._first_ns = stamp_ns
         if self._rest is not None:
@@ -90,7 +91,7 @@ class Starter:
             # At rest nothing tells how the camera sits on the body.
             if state_at_rest is not None and self._calibration.extrinsics != "find":
                 self._record(InitialisationAttempt(stamp_ns=stamp_ns, method="rest", succeeded=True))
-                return Start(state=state_at_rest, method="rest")
+                return Start(state=state_at_rest, method="rest", camera_delay_s=delay_s)
         if self._motion is None:
             return None
         start, attempt = self._motion.push(measurement)

@@ -15,7 +15,8 @@ class Start:
         method: ``rest``, ``motion`` or ``given``.
         T_body_cam: (4, 4) of camera 0 where the start found it otherwise than calibrated, else None.
         rotation_sigma: rad, standard deviation of its rotation, where it was found.
-        delay_s: s by which the images were taken later than they are stamped, as far as the start found it.
+        camera_delay_s: s, of the camera's clock, with what the stamps of the windows contain of it already
+            (``t_imu = t_cam + delay``); None where only the rig knows.
         replay: the windows after ``state.stamp_ns`` that have already been seen, oldest first: the estimator
             goes through them again from here, so that what they hold is not lost (and not used twice: the
             covariance of ``state`` must be wide enough to stand for a guess).
@@ -25,7 +26,7 @@ class Start:
     method: str
     T_body_cam: Array | None = None
     rotation_sigma: float = 0.0
-    delay_s: float = 0.0
+    camera_delay_s: float | None = None
     replay: tuple[Measurement, ...] = ()
 
 
