@@ -12,12 +12,12 @@ from vioframe.errors import ConfigError, DataError, StateError
 from vioframe.geometry import camera as projection
 from vioframe.interfaces import IMAGES, STEREO, STEREO_TRACKS, TRACKS, Frontend
 from vioframe.types import Camera, Frame, Image, SensorRig, Tracks, VisualFeatures
+from vioframe.vision.corners import CornerDetector
 from vioframe.vision.gray import gray_image, normalise_exposure
 from vioframe.vision.outliers import epipolar_inliers
 from vioframe.vision.spread import crowded
 from vioframe.vision.two_cameras import TwoCameras
 from vioframe_klt.anchors import Anchors
-from vioframe_klt.detector import CornerDetector
 from vioframe_klt.points import Points, inside
 from vioframe_klt.search import Search
 from vioframe_klt.stereo import StereoMatcher
@@ -303,7 +303,7 @@ class KltFrontend(Frontend):
         """Thin points that have run together, and take new corners where there is room."""
         points = self._points
         self._keep(~crowded(points.pixels, points.ages, points.ids, 0.5 * self._min_distance))
-        corners = self._detector.detect(gray, self._points.pixels, self._max_points - len(self._points))
+        corners, _ = self._detector.detect(gray, self._points.pixels, self._max_points - len(self._points))
         ids = np.arange(self._next_id, self._next_id + len(corners), dtype=np.int64)
         self._next_id += len(corners)
         self._points = self._points.joined(ids, corners, projection.bearings(camera, corners))

@@ -59,11 +59,22 @@ class TwoCameras:
         return inverse_depth, possible & self.near_line(bearings, bearings_right)
 
     def near_line(self, bearings: Array, bearings_right: Array) -> Mask:
-        """Which rays (..., 3) of the two cameras lie in one epipolar plane (...); leading axes broadcast."""
-        normal = np.cross(self._turned(bearings), self._base)
-        length = np.linalg.norm(normal, axis=-1)
+        """Which rays (M, 3) and (M, 3) of the two cameras lie in one epipolar plane (M,)."""
+        normal, length = self._planes(bearings)
         near: Mask = np.abs(np.sum(normal * bearings_right, axis=-1)) < self._threshold * length
         return near
+
+    def possible_pairs(self, bearings: Array, bearings_right: Array) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs (rows, columns) of rays (M, 3) and (K, 3) that can be one point."""
+        normal, length = self._planes(bearings)
+        rows, columns = np.nonzero(np.abs(normal @ bearings_right.T) < (self._threshold * length)[:, None])
+        _, possible = self.inverse_depth(bearings[rows], bearings_right[columns])
+        return rows[possible], columns[possible]
+
+    def _planes(self, bearings: Array) -> tuple[Array, Array]:
+        """Normals (M, 3) of the epipolar planes, in the axes of camera 1, and their lengths (M,)."""
+        normal = np.cross(self._turned(bearings), self._base)
+        return normal, np.linalg.norm(normal, axis=-1)
 
     def _turned(self, bearings: Array) -> Array:
         """Rays at depth 1 in camera 0, in the axes of camera 1."""

@@ -11,9 +11,9 @@ from vioframe.errors import ConfigError, DataError, ShapeError, StateError
 from vioframe.geometry import camera as projection
 from vioframe.geometry import so3
 from vioframe.types import Camera, Frame, ImuNoise, SensorRig
+from vioframe.vision.corners import CornerDetector
 from vioframe.vision.outliers import epipolar_inliers
 from vioframe_klt import KltFrontend
-from vioframe_klt.detector import CornerDetector
 
 SIZE = (376, 240)
 NOISE = ImuNoise(gyro_noise=1e-4, gyro_walk=1e-5, accel_noise=1e-3, accel_walk=1e-4, rate_hz=200.0)
@@ -184,7 +184,7 @@ def test_detector_places_corners_where_they_are():
         detector = CornerDetector(
             min_distance_px=30.0, quality=0.5, min_gradient=1.0, scale=scale, allowed=np.full((240, 376), 255, np.uint8)
         )
-        found = detector.detect(image, np.zeros((0, 2)), 10)
+        found, _ = detector.detect(image, np.zeros((0, 2)), 10)
         distance = np.linalg.norm(found[:, None] - (corners - 0.5)[None], axis=-1)
         assert distance.min(axis=0).max() < 1.0
 

@@ -32,11 +32,13 @@ class CornerDetector:
         self._scale = scale
         self._allowed = allowed[::scale, ::scale] > 0
 
-    def detect(self, gray: np.ndarray, taken: Array, count: int) -> Array:
-        """Return up to ``count`` corners (K, 2) px, away from the points ``taken`` (M, 2) px.
+    def detect(self, gray: np.ndarray, taken: Array, count: int) -> tuple[Array, Array]:
+        """Return up to ``count`` corners (K, 2) px, away from the points ``taken`` (M, 2) px, and their strengths (K,).
 
         Args:
             gray: (H, W) uint8.
+            taken: points already followed.
+            count: of corners wanted.
         """
         scale = self._scale
         small = gray if scale == 1 else cv2.resize(gray, self._allowed.shape[::-1], interpolation=cv2.INTER_AREA)
@@ -49,7 +51,7 @@ class CornerDetector:
         candidates = local_maximum & free & (strength > max(self._quality * peak, self._floor))
         rows, columns = np.nonzero(candidates)
         if len(rows) == 0 or count <= 0:
-            return np.zeros((0, 2))
+            return np.zeros((0, 2)), np.zeros(0)
         points = np.stack([columns, rows], axis=-1)
         height, width = strength.shape
         chosen = choose_spread(
@@ -63,7 +65,7 @@ class CornerDetector:
         points = points[chosen]
         refined = _refine(strength, points)
         # The centre of pixel x of the half-size image lies at 2x + 0.5 of the full one.
-        return refined * scale + 0.5 * (scale - 1)
+        return refined * scale + 0.5 * (scale - 1), strength[points[:, 1], points[:, 0]].astype(float)
 
     def _free_space(self, taken: Array) -> np.ndarray:
         if len(taken) == 0:

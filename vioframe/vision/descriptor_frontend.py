@@ -1,0 +1,156 @@
+"""A front end of any keypoints with descriptors: extract, match, keep."""
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+
+from vioframe.checks import Array
+from vioframe.errors import DataError, StateError
+from vioframe.geometry import camera as projection
+from vioframe.interfaces import IMAGES, STEREO, STEREO_TRACKS, TRACKS, Frontend
+from vioframe.types import Camera, Frame, SensorRig, Tracks, VisualFeatures
+from vioframe.vision.gray import gray_image, normalise_exposure
+from vioframe.vision.keeper import KeeperOptions, TrackKeeper
+from vioframe.vision.keypoints import Extractor, Keypoints
+from vioframe.vision.matching import match
+from vioframe.vision.two_cameras import TwoCameras
+
+
+class DescriptorFrontend(Frontend):
+    """Tracks of the keypoints that an extractor finds in each image by itself.
+
+    What is found is the extractor's business; which of them are the same point, the keeper's. A subclass brings
+    an extractor and the options of its users.
+
+    Args:
+        name: as the user calls it, for messages.
+        extractor: of keypoints and descriptors.
+        options: of the keeper.
+        stereo: also match with camera 1.
+        min_depth: nearer points are not matched there, m.
+        normalise: bring every image to one mean and contrast.
+        border_px: no points nearer to the edge of the image.
+    """
+
+    def __init__(
+        self,
+        *,
+        name: str,
+        extractor: Extractor,
+        options: KeeperOptions,
+        stereo: bool,
+        min_depth: float,
+        normalise: bool,
+        border_px: int,
+    ) -> None:
+        # What it needs and gives depends on its options, so the instance says it, not the class.
+        self.requires = frozenset({IMAGES, STEREO} if stereo else {IMAGES})  # type: ignore[misc]
+        self.provides = frozenset({TRACKS, STEREO_TRACKS} if stereo else {TRACKS})  # type: ignore[misc]
+        self._name = name
+        self._extractor = extractor
+        self._options = options
+        self._stereo = stereo
+        self._min_depth = min_depth
+        self._normalise = normalise
+        self._border = border_px
+        self._camera: Camera | None = None
+
+    def setup(self, rig: SensorRig) -> None:
+        """Forget all points; ids start again at 0.
+
+        Raises:
+            DataError: the rig has fewer cameras than are looked at, or two at one place.
+        """
+        needed = 2 if self._stereo else 1
+        if len(rig.cameras) < needed:
+            raise DataError(
+                f"frontend={self._name}{' with stereo=true' * self._stereo} needs {needed} camera"
+                f"{'s' * self._stereo}, but the recording's calibration has {len(rig.cameras)}"
+            )
+        self._camera = rig.cameras[0]
+        self._cameras = rig.cameras[:needed]
+        self._masks = [_inner(camera, self._border) for camera in self._cameras]
+        self._keeper = TrackKeeper(self._camera, self._options)
+        self._pair = (
+            TwoCameras(*self._cameras, epipolar_px=self._options.outlier_px, min_depth=self._min_depth)
+            if self._stereo
+            else None
+        )
+        self._points = 0
+        self._lost_all = 0
+
+    def counters(self) -> Mapping[str, int]:
+        """How often every point was lost at once."""
+        return {"lost all tracks": self._lost_all} if self._camera is not None and self._lost_all else {}
+
+    def process(self, frame: Frame, R_prev_cur: Array | None = None) -> VisualFeatures:
+        """Find the points of the image, and their ids.
+
+        Scores are the number of images a point has been seen in.
+
+        Raises:
+            StateError: called before ``setup``.
+            DataError: the frame lacks an image, or has one that does not fit the calibration.
+        """
+        if self._camera is None:
+            raise StateError(f"{type(self).__name__}.process was called before setup(rig): set it up first")
+        keypoints, bearings = self._see(frame, 0)
+        R_cam = None
+        if R_prev_cur is not None:
+            R_body_cam = self._camera.T_body_cam[:3, :3]
+            R_cam = R_body_cam.T @ R_prev_cur @ R_body_cam
+        ids, index, ages = self._keeper.keep(keypoints, bearings, R_cam)
+        self._lost_all += self._points > 0 and not (ages > 1).any()
+        self._points = len(ids)
+        points, bearings = keypoints.select(index), bearings[index]
+        tracks = Tracks(
+            ids=ids,
+            pixels=points.pixels,
+            bearings=bearings,
+            scores=ages.astype(float),
+            descriptors=points.descriptors,
+        )
+        stereo = self._match_stereo(frame, tracks, self._pair, points) if self._pair is not None else None
+        return VisualFeatures(frame=frame, tracks=tracks, stereo=stereo)
+
+    def _see(self, frame: Frame, index: int) -> tuple[Keypoints, Array]:
+        camera = self._cameras[index]
+        gray = gray_image(frame, index, camera, self._name)
+        keypoints = self._extractor.extract(normalise_exposure(gray) if self._normalise else gray, self._masks[index])
+        return keypoints, projection.bearings(camera, keypoints.pixels)
+
+    def _match_stereo(self, frame: Frame, tracks: Tracks, pair: TwoCameras, points: Keypoints) -> Tracks:
+        """The points that camera 1 sees too."""
+        keypoints, bearings = self._see(frame, 1)
+        rows, columns = pair.possible_pairs(tracks.bearings, bearings)
+        rows, columns = match(
+            points.descriptors,
+            keypoints.descriptors,
+            rows,
+            columns,
+            max_distance=self._options.max_distance,
+            ratio=self._options.ratio,
+        )
+        return Tracks(
+            ids=tracks.ids[rows],
+            pixels=keypoints.pixels[columns],
+            bearings=bearings[columns],
+            scores=tracks.scores[rows],
+            descriptors=keypoints.descriptors[columns],
+            camera=1,
+        )
+
+
+def _inner(camera: Camera, border: int) -> np.ndarray:
+    """255 in (H, W) uint8 off the edge and where the camera model can be inverted; decided at every fourth pixel."""
+    width, height = camera.size_px
+    columns, rows = np.meshgrid(np.arange(0, width, 4.0), np.arange(0, height, 4.0))
+    pixels = np.stack([columns, rows], axis=-1)
+    with np.errstate(all="ignore"):
+        back, _ = projection.project(camera, projection.bearings(camera, pixels))
+        usable = np.linalg.norm(back - pixels, axis=-1) < 0.5
+    mask = cv2.resize(usable.astype(np.uint8) * 255, (width, height), interpolation=cv2.INTER_NEAREST)
+    allowed = np.zeros((height, width), np.uint8)
+    allowed[border : height - border, border : width - border] = mask[border : height - border, border : width - border]
+    return allowed

@@ -1,0 +1,213 @@
+"""Lasting ids for points that are found anew in every image."""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from vioframe.checks import Array, Stamps
+from vioframe.geometry import camera as projection
+from vioframe.types import Camera
+from vioframe.vision.keypoints import Keypoints
+from vioframe.vision.matching import match, pairs_near
+from vioframe.vision.outliers import epipolar_inliers
+from vioframe.vision.spread import choose_spread
+
+_FEWEST_JUDGED = 8
+_NEIGHBOURS = 5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeeperOptions:
+    """How points are found again.
+
+    Attributes:
+        max_points: most points that have an id at once.
+        min_distance_px: of a new point from all others.
+        search_px: how far from where the gyro's rotation puts it a point is looked for.
+        blind_search_px: the same without a gyro.
+        memory_images: for how many images an absent point is remembered.
+        max_distance: of two descriptors of one point.
+        ratio: to the second nearest descriptor.
+        reject_outliers: by epipolar geometry.
+        outlier_px: distance from the epipolar line that contradicts it.
+    """
+
+    max_points: int
+    min_distance_px: float
+    search_px: float
+    blind_search_px: float
+    memory_images: int
+    max_distance: float
+    ratio: float
+    reject_outliers: bool
+    outlier_px: float
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class _Seen:
+    """An image of the past: ids (M,) ascending, rays (M, 3), and the camera's rotation since (3, 3)."""
+
+    ids: Stamps
+    bearings: Array
+    R_then_now: Array
+
+
+class TrackKeeper:
+    """Matches the keypoints of each image with the points remembered, and gives new ids to the rest.
+
+    A point is looked for near where the gyro's rotation since it was last seen puts it, by its last descriptor;
+    absent for a few images, it may come back with its id. Matches must agree with the epipolar geometry of the
+    image in which the point was last seen and this one.
+
+    Args:
+        camera: calibration.
+        options: see there.
+    """
+
+    def __init__(self, camera: Camera, options: KeeperOptions) -> None:
+        self._camera = camera
+        self._options = options
+        self._threshold = options.outlier_px / float(np.mean(camera.intrinsics_px[:2]))
+        self._images = 0
+        self._next_id = 0
+        # Everything remembered, seen in the last image or not.
+        self._ids: Stamps = np.zeros(0, dtype=np.int64)
+        self._ages: np.ndarray = np.zeros(0, dtype=np.int64)
+        self._absent: np.ndarray = np.zeros(0, dtype=np.int64)
+        self._bearings: Array = np.zeros((0, 3))
+        # Displacement an image that rotation does not explain, px; NaN where a point was seen once.
+        self._drift: Array = np.zeros((0, 2))
+        self._descriptors: np.ndarray = np.zeros((0, 0), np.uint8)
+        self._past: deque[_Seen] = deque(maxlen=options.memory_images)
+
+    def keep(
+        self, keypoints: Keypoints, bearings: Array, R_prev_cur: Array | None
+    ) -> tuple[Stamps, np.ndarray, np.ndarray]:
+        """Take the next image.
+
+        Args:
+            keypoints: K of it.
+            bearings: (K, 3) of them.
+            R_prev_cur: (3, 3) rotation of the camera since the image before, by the gyro, or None.
+
+        Returns:
+            ids (M,) ascending, which keypoints (M,) they are, and in how many images each was seen (M,).
+        """
+        for image in self._past:
+            image.R_then_now = image.R_then_now @ (np.eye(3) if R_prev_cur is None else R_prev_cur)
+        known, found = self._find(keypoints, R_prev_cur is not None)
+        if self._options.reject_outliers and len(known):
+            agree = self._agreeing(known, bearings[found], R_prev_cur is not None)
+            known, found = known[agree], found[agree]
+        fresh = self._choose_new(keypoints, found)
+        self._remember(keypoints, bearings, known, found, fresh)
+        self._images += 1
+        here = np.flatnonzero(self._absent == 0)
+        index = np.concatenate([found, fresh])
+        self._past.appendleft(_Seen(ids=self._ids[here], bearings=self._bearings[here], R_then_now=np.eye(3)))
+        return self._ids[here], index, self._ages[here]
+
+    def _find(self, keypoints: Keypoints, gyro: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of the memory, ascending, and the keypoints that match them."""
+        if len(self._ids) == 0 or len(keypoints) == 0:
+            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        expected, visible = projection.project(self._camera, self._turned())
+        expected = expected + self._drifts(expected) * (1.0 + self._absent)[:, None]
+        reach = self._options.search_px if gyro else self._options.blind_search_px
+        radius = np.where(visible, reach * np.sqrt(1.0 + self._absent), 0.0)
+        rows, columns = pairs_near(np.where(visible[:, None], expected, -1e4), keypoints.pixels, radius)
+        return match(
+            self._descriptors,
+            keypoints.descriptors,
+            rows,
+            columns,
+            max_distance=self._options.max_distance,
+            ratio=self._options.ratio,
+        )
+
+    def _turned(self) -> Array:
+        """Rays (M, 3) of what is remembered, in the camera now, if it had only turned."""
+        if len(self._ids) == 0:
+            return self._bearings
+        rotations = np.stack([image.R_then_now for image in self._past])[self._absent]
+        turned: Array = (self._bearings[:, None, :] @ rotations)[:, 0]
+        return turned
+
+    def _drifts(self, expected: Array) -> Array:
+        """What parallax adds an image (M, 2) px: as last seen, or as the nearest points have it."""
+        known = np.flatnonzero(~np.isnan(self._drift[:, 0]))
+        unknown = np.flatnonzero(np.isnan(self._drift[:, 0]))
+        if len(known) < _NEIGHBOURS:
+            return np.nan_to_num(self._drift)
+        drift = self._drift.copy()
+        if len(unknown):
+            apart = np.sum((expected[unknown, None] - expected[known]) ** 2, axis=-1)
+            nearest = known[np.argpartition(apart, _NEIGHBOURS - 1, axis=1)[:, :_NEIGHBOURS]]
+            drift[unknown] = np.median(self._drift[nearest], axis=1)
+        return drift
+
+    def _agreeing(self, known: np.ndarray, bearings: Array, gyro: bool) -> np.ndarray:
+        """Which matches (M,) agree with the epipolar geometry of this image and the one the point was last seen in."""
+        agree = np.zeros(len(known), dtype=bool)
+        ids, absent = self._ids[known], self._absent[known]
+        for images_ago in np.unique(absent):
+            past = self._past[images_ago]
+            mine = absent == images_ago
+            # Points seen in that image and since are judged with the others, for more of them to agree.
+            _, then, now = np.intersect1d(past.ids, ids, assume_unique=True, return_indices=True)
+            if len(then) < _FEWEST_JUDGED:
+                agree |= mine & (images_ago == 0)
+                continue
+            inliers = np.zeros(len(known), dtype=bool)
+            R_then_now = past.R_then_now if gyro else None
+            inliers[now] = epipolar_inliers(
+                past.bearings[then], bearings[now], R_then_now, self._threshold, seed=self._images
+            )
+            agree |= mine & inliers
+        return agree
+
+    def _choose_new(self, keypoints: Keypoints, taken: np.ndarray) -> np.ndarray:
+        """Keypoints that are given new ids."""
+        room = self._options.max_points - len(taken)
+        free = np.ones(len(keypoints), dtype=bool)
+        free[taken] = False
+        if len(taken):
+            reach = np.full(len(taken), self._options.min_distance_px)
+            _, near = pairs_near(keypoints.pixels[taken], keypoints.pixels, reach)
+            free[near] = False
+        rows = np.flatnonzero(free)
+        chosen = choose_spread(
+            keypoints.pixels[rows],
+            keypoints.scores[rows],
+            keypoints.pixels[taken],
+            size_px=self._camera.size_px,
+            distance=self._options.min_distance_px,
+            count=room,
+        )
+        new: np.ndarray = rows[chosen]
+        return new
+
+    def _remember(
+        self, keypoints: Keypoints, bearings: Array, known: np.ndarray, found: np.ndarray, fresh: np.ndarray
+    ) -> None:
+        turned = self._turned()[known]
+        plain, visible = projection.project(self._camera, turned)
+        moved = (keypoints.pixels[found] - plain) / (1.0 + self._absent[known])[:, None]
+        self._drift[known] = np.where(visible[:, None], moved, np.nan)
+        self._absent += 1
+        self._absent[known] = 0
+        self._ages[known] += 1
+        self._bearings[known] = bearings[found]
+        if len(known):
+            self._descriptors[known] = keypoints.descriptors[found]
+        keep = self._absent < self._options.memory_images
+        ids = np.arange(self._next_id, self._next_id + len(fresh), dtype=np.int64)
+        self._next_id += len(fresh)
+        descriptors = self._descriptors if len(self._ids) else keypoints.descriptors[:0]
+        self._ids = np.concatenate([self._ids[keep], ids])
+        self._ages = np.concatenate([self._ages[keep], np.ones(len(ids), dtype=np.int64)])
+        self._absent = np.concatenate([self._absent[keep], np.zeros(len(ids), dtype=np.int64)])
+        self._bearings = np.concatenate([self._bearings[keep], bearings[fresh]])
+        self._drift = np.concatenate([self._drift[keep], np.full((len(ids), 2), np.nan)])
+        self._descriptors = np.concatenate([descriptors[keep], keypoints.descriptors[fresh]])
