@@ -78,6 +78,7 @@ class BowLoop(LoopCloser):
         """Forget the last sequence and take the next one's calibration; load the map to start in, if any."""
         if not rig.cameras:
             raise DataError("loop=bow needs a camera, and this rig has none: choose loop=none")
+        graph.load_solver()
         options = self._retrieval
         self._camera = rig.cameras[0]
         self._focal_px = float(self._camera.intrinsics_px[:2].mean())

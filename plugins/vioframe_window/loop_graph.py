@@ -61,6 +61,11 @@ class Edges:
         )
 
 
+def load_solver() -> None:
+    """Import the sparse solver now: the first loop closure would else stand still for a fifth of a second."""
+    import scipy.sparse.linalg  # noqa: F401
+
+
 def wrap(angle: Array) -> Array:
     """The same angles (...) rad in (−π, π]."""
     wrapped: Array = np.pi - (np.pi - angle) % (2.0 * np.pi)
