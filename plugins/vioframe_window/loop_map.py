@@ -3,6 +3,7 @@
 import os
 import zipfile
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,8 @@ _ARRAYS: dict[str, tuple[tuple[int | None, ...], type[Any]]] = {
     "camera_distortion": ((None,), np.floating),
     "T_body_cam": ((4, 4), np.floating),
 }
+# What an archive raises that is cut off, encrypted, not an archive, or states an array larger than memory.
+_UNREADABLE = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, KeyError, RuntimeError, MemoryError, OverflowError)
 # Rotation rad and position m by which calibrations of one and the same rig may differ.
 _ROTATION_APART, _POSITION_APART_M = 0.05, 0.05
 
@@ -87,7 +90,8 @@ def load_map(path: Path, camera: Camera) -> PlaceMap:
     try:
         for name, (shape, dtype) in _ARRAYS.items():
             check_array(f"{what}: {name}", arrays[name], shape, dtype)
-        check_pose(f"{what}: T_map_body", arrays["T_map_body"], tolerance=1e-4)
+        for name in ("T_map_body", "T_body_cam"):
+            check_pose(f"{what}: {name}", arrays[name], tolerance=1e-4)
     except VioframeError as error:
         raise DataError(f"{error}: this file is damaged or no map; save it again") from error
     counts = arrays["corner_counts"]
@@ -114,7 +118,6 @@ def load_map(path: Path, camera: Camera) -> PlaceMap:
 
 
 def _read(path: Path, what: str) -> dict[str, np.ndarray]:
-    wanted = ("version", *_ARRAYS)
     try:
         with zipfile.ZipFile(path) as parts:
             unpacked = sum(part.file_size for part in parts.infolist())
@@ -122,18 +125,21 @@ def _read(path: Path, what: str) -> dict[str, np.ndarray]:
             raise DataError(f"{what}: unpacks to {unpacked / 2**30:.1f} GiB, which no map does")
         # Without pickles an array file is numbers; with them it could hold a program.
         with np.load(path, allow_pickle=False) as stored:
-            missing = [name for name in wanted if name not in stored.files]
-            if missing:
-                raise DataError(f"{what} is no map of places: it has no {missing[0]}")
-            arrays = {name: stored[name] for name in wanted}
+            _check_parts(what, stored)
+            return {name: stored[name] for name in _ARRAYS}
     except OSError as error:
         raise DataError(f"{what}: cannot be read: {error.strerror or error}") from error
-    except (zipfile.BadZipFile, ValueError, EOFError, KeyError, zlib.error) as error:
+    except _UNREADABLE as error:
         raise DataError(f"{what} is no map of places, or is damaged: {error}") from error
-    version = arrays["version"]
-    if version.shape != (1,) or int(version[0]) != VERSION:
-        raise DataError(f"{what} is a map of version {version.tolist()}, but this program reads version {VERSION}")
-    return arrays
+
+
+def _check_parts(what: str, stored: Mapping[str, np.ndarray]) -> None:
+    version = stored["version"] if "version" in stored else np.zeros(0)
+    if version.shape == (1,) and version[0] != VERSION:
+        raise DataError(f"{what} is a map of version {version[0]}, but this program reads version {VERSION}")
+    missing = [name for name in ("version", *_ARRAYS) if name not in stored]
+    if missing or version.shape != (1,):
+        raise DataError(f"{what} is no map of places: it has no {[*missing, 'version'][0]}")
 
 
 def _calibration(camera: Camera) -> dict[str, np.ndarray]:

@@ -1,6 +1,8 @@
 """Maps on disk: to be started in, to be refused where they do not belong, and never to run anything."""
 
+import io
 import pickle
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -135,7 +137,7 @@ def test_a_map_with_a_program_in_it_runs_nothing(stored: tuple[Path, PointWorld,
 def spoil(parts: dict[str, np.ndarray], name: str) -> None:
     if name == "corner_counts":
         parts[name] = parts[name] + 1
-    elif name == "T_map_body":
+    elif name in ("T_map_body", "T_body_cam"):
         parts[name] = 2.0 * parts[name]
     elif name == "version":
         parts[name] = np.array([99])
@@ -145,7 +147,7 @@ def spoil(parts: dict[str, np.ndarray], name: str) -> None:
         del parts[name]
 
 
-@pytest.mark.parametrize("name", ["corner_counts", "T_map_body", "version", "descriptors", "bearings"])
+@pytest.mark.parametrize("name", ["corner_counts", "T_map_body", "T_body_cam", "version", "descriptors", "bearings"])
 def test_a_map_that_does_not_hold_together_is_refused(
     stored: tuple[Path, PointWorld, np.ndarray], tmp_path: Path, name: str
 ) -> None:
@@ -155,6 +157,19 @@ def test_a_map_that_does_not_hold_together_is_refused(
     np.savez(tmp_path / "bad.npz", **parts)
     with pytest.raises(DataError, match="bad.npz"):
         load_map(tmp_path / "bad.npz", CAMERA)
+
+
+def test_an_array_that_states_more_than_it_holds_is_refused(
+    stored: tuple[Path, PointWorld, np.ndarray], tmp_path: Path
+) -> None:
+    path = tmp_path / "bad.npz"
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**14, 2)})
+    with zipfile.ZipFile(stored[0]) as good, zipfile.ZipFile(path, "w") as bad:
+        for name in good.namelist():
+            bad.writestr(name, header.getvalue() if name == "pixels.npy" else good.read(name))
+    with pytest.raises(DataError, match="bad.npz"):
+        load_map(path, CAMERA)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a map", None])
