@@ -106,7 +106,10 @@ def test_presets_close_loops_unless_told_otherwise():
     assert "_target_" in composed("system=vins_mono").fuser.loop
     assert not composed("system=vins_mono", "loop=none").fuser.loop
     assert not composed("fuser=window").fuser.loop
-    assert composed("system=vins_stereo").rig.cameras == 2
+    assert not composed("system=okvis").fuser.loop
+    for system in ("vins_stereo", "okvis"):
+        config = composed(f"system={system}")
+        assert (config.rig.cameras, config.frontend.stereo) == (2, True)
 
 
 def test_unknown_fuser_options_are_refused_by_hydra():
