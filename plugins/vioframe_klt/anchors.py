@@ -32,8 +32,8 @@ class Anchors:
         self._side = window_px
         reach = np.arange(-half - 1, half + 2, dtype=np.float32)
         self._wide = np.stack(np.meshgrid(reach, reach), axis=-1)
-        self._grid = np.ascontiguousarray(self._wide[1:-1, 1:-1].reshape(-1, 2))
-        squared = np.sum(self._grid**2, axis=-1) / half**2
+        self._grid = np.ascontiguousarray(self._wide[1:-1, 1:-1].reshape(-1, 2).T)
+        squared = np.sum(self._grid**2, axis=0) / half**2
         weight = np.exp(-0.5 * squared / _WEIGHT_SPREAD**2)
         self._weight = (weight / weight.sum()).astype(np.float32)
         count = window_px * window_px
@@ -86,8 +86,11 @@ class Anchors:
         solver = self._solver if rows is None else self._solver[rows]
         p, A = pixels.astype(np.float32), bend.copy()
         step = np.empty_like(A)
+        contrast = None
         for _ in range(steps):
-            patch, contrast = self._sample(image, p, A)
+            patch = self._sample(image, p, A)
+            # The light on a patch hardly changes between steps.
+            contrast = self._contrast(patch) if contrast is None else contrast
             change = (solver @ patch[:, :, None])[:, :, 0] / contrast[:, None]
             step[:, 0, 0], step[:, 0, 1] = 1.0 + change[:, 0], change[:, 1]
             step[:, 1, 0], step[:, 1, 1] = change[:, 2], 1.0 + change[:, 3]
@@ -98,16 +101,27 @@ class Anchors:
             determinant = step[:, 0, 0] * step[:, 1, 1] - step[:, 0, 1] * step[:, 1, 0]
             A = A @ (inverse / np.where(np.abs(determinant) > 0.1, determinant, 0.1)[:, None, None])
             p = p - (A @ change[:, 4:, None])[:, :, 0]
-        patch, contrast = self._sample(image, p, A)
-        correlation = np.sum(patch * weighted, axis=-1) / contrast
+        patch = self._sample(image, p, A)
+        correlation = (weighted[:, None, :] @ patch[:, :, None])[:, 0, 0] / self._contrast(patch)
         return p.astype(float), A, correlation.astype(float)
 
-    def _sample(self, image: Image, p: np.ndarray, A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Patches (K, side²) with their weighted mean taken off, and the root of their weighted variance (K,)."""
-        where = self._grid @ A.transpose(0, 2, 1) + p[:, None, :]
-        patch = cv2.remap(image, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
-        patch -= (patch @ self._weight)[:, None]
-        return patch, np.sqrt(np.maximum((patch * patch) @ self._weight, _SMALLEST))
+    def _sample(self, image: Image, p: np.ndarray, A: np.ndarray) -> np.ndarray:
+        """Patches (K, side²) float32; their means stay in, since what they are multiplied with adds up to zero."""
+        x, y = self._grid
+        where = np.empty((len(p), len(x), 2), np.float32)
+        for axis in (0, 1):
+            place = np.multiply(A[:, axis, :1], x, out=where[:, :, axis])
+            place += A[:, axis, 1:] * y
+            place += p[:, axis, None]
+        patch = cv2.remap(image, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        sampled: np.ndarray = patch.astype(np.float32)
+        return sampled
+
+    def _contrast(self, patch: np.ndarray) -> np.ndarray:
+        """Root of the weighted variance (K,) of patches (K, side²)."""
+        mean = patch @ self._weight
+        contrast: np.ndarray = np.sqrt(np.maximum((patch * patch) @ self._weight - mean * mean, _SMALLEST))
+        return contrast
 
     def _cut(self, image: Image, pixels: Array) -> tuple[np.ndarray, np.ndarray]:
         count, side, weight = len(pixels), self._side, self._weight
@@ -120,7 +134,7 @@ class Anchors:
         template = template - (template @ weight)[:, None]
         contrast = np.sqrt(np.maximum((template * template) @ weight, _SMALLEST))
         template /= contrast[:, None]
-        x, y = self._grid.T
+        x, y = self._grid
         slopes = np.stack([along_x * x, along_x * y, along_y * x, along_y * y, along_x, along_y], axis=1)
         slopes -= (slopes @ weight)[:, :, None]
         slopes -= ((slopes * weight) @ template[:, :, None]) * template[:, None, :]
