@@ -19,8 +19,8 @@ from vioframe.geometry import so3
 from vioframe.tight.inertial_window import InertialWindow
 from vioframe.tight.two_view_rotation import normal_equations
 
-_ITERATIONS = 6
-_SETTLED = 1e-5
+# Factors on sigma, one an iteration: further off, fewer points are outliers.
+_LOOSENESS = (4.0, 2.0, 1.0, 1.0, 1.0, 1.0)
 _BIAS_SIGMA = 0.3
 
 
@@ -68,21 +68,21 @@ def fit_rotations(
     T = pairs.ends - pairs.starts
     start = R_body_cam
     prior = np.diag(np.repeat([1.0 / _BIAS_SIGMA**2, 1.0 / rotation_sigma**2], 3))
-    for _ in range(_ITERATIONS):
+    trust = weight
+    for looseness in _LOOSENESS:
         R_first, R_second = inertial.rotations(pairs.starts, bias), inertial.rotations(pairs.ends, bias)
         R_body = R_first.swapaxes(-1, -2) @ R_second
         R_cam = R_body_cam.T @ R_body @ R_body_cam
-        H, gradient, _, _ = normal_equations(R_cam, pairs.first, pairs.second, weight, pairs.sigma)
+        equations = normal_equations(R_cam, pairs.first, pairs.second, weight, looseness * pairs.sigma, trust)
+        H, trust = equations.H, equations.trust
         middle = so3.exp(0.5 * so3.log(R_body))
         by_bias = -T[:, None, None] * (R_body_cam.T @ middle.swapaxes(-1, -2))
         J = np.concatenate([by_bias, np.eye(3) - R_cam.swapaxes(-1, -2)], axis=-1)
         normal = (J.swapaxes(-1, -2) @ H @ J).sum(axis=0) + prior
         turned = so3.log(start.T @ R_body_cam)
-        right = (J.swapaxes(-1, -2) @ gradient[..., None])[..., 0].sum(axis=0)
+        right = (J.swapaxes(-1, -2) @ equations.gradient[..., None])[..., 0].sum(axis=0)
         right[3:] += turned / rotation_sigma**2
         step = np.linalg.solve(normal, -right)
         bias, R_body_cam = bias + step[:3], R_body_cam @ so3.exp(step[3:])
-        if np.linalg.norm(step) < _SETTLED:
-            break
     sigma = float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(normal)[3:, 3:])[-1]))
     return RotationFit(gyro_bias=bias, R_body_cam=R_body_cam, rotation_sigma=sigma)

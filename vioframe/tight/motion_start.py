@@ -295,7 +295,7 @@ class MotionStart:
         examination.at_least(
             "inliers",
             result.inliers,
-            0.7,
+            0.55,
             "",
             doctor.POOR_FIT,
             f"only {result.inliers:.0%} of the sightings fit one rigid scene: wait for better tracks",

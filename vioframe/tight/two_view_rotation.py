@@ -16,7 +16,8 @@ import numpy as np
 from vioframe.checks import Array, Mask
 from vioframe.geometry import so3
 
-_ITERATIONS = 7
+# Factors on sigma, one an iteration: from afar no point is an outlier, from near by some are.
+_LOOSENESS = (16.0, 8.0, 4.0, 2.0, 1.0, 1.0, 1.0, 1.0)
 # A residual of this many sigmas counts half, as by Cauchy's loss; tracks that jumped count nothing.
 _CAUCHY = 2.0
 
@@ -47,7 +48,7 @@ def relative_rotations(
         first: (P, M, 3) unit vectors in the first camera of each pair.
         second: (P, M, 3) the same points in the second.
         common: (P, M) which points both see.
-        starts: rotations (P, 3, 3) to search from.
+        starts: rotations (P, 3, 3) to search from; the first may be far off, others are taken for close.
         sigma: rad, of a bearing.
     """
     pairs = len(first)
@@ -55,10 +56,16 @@ def relative_rotations(
     weight = np.tile(common.astype(float), (count, 1))
     b1, b2 = np.tile(first, (count, 1, 1)), np.tile(second, (count, 1, 1))
     R = np.concatenate(starts)
-    for _ in range(_ITERATIONS):
-        H, gradient, _, _ = normal_equations(R, b1, b2, weight, sigma)
-        R = R @ so3.exp(-np.linalg.solve(H + 1e-6 * np.eye(3), gradient[..., None])[..., 0])
-    H, _, cost, squares = normal_equations(R, b1, b2, weight, sigma)
+    trust = weight
+    near = (np.arange(len(R)) >= pairs)[:, None]
+    for looseness in _LOOSENESS:
+        loose = np.where(near, min(looseness, 2.0), looseness) * sigma
+        equations = normal_equations(R, b1, b2, weight, loose, trust)
+        trust = equations.trust
+        step = np.linalg.solve(equations.H + 1e-6 * np.eye(3), equations.gradient[..., None])[..., 0]
+        R = R @ so3.exp(-step)
+    equations = normal_equations(R, b1, b2, weight, sigma, trust)
+    cost, squares, H = equations.cost, equations.squares, equations.H
     best = np.argmin(cost.reshape(count, pairs), axis=0) * pairs + np.arange(pairs)
     points = common.sum(axis=1)
     return TwoViewRotations(
@@ -66,11 +73,38 @@ def relative_rotations(
     )
 
 
-def normal_equations(R: Array, b1: Array, b2: Array, weight: Array, sigma: float) -> tuple[Array, Array, Array, Array]:
-    """Normal matrix (P, 3, 3) and gradient (P, 3) of the rotation with t eliminated; robust cost, weighted squares."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EpipolarEquations:
+    """Gauss–Newton's equations of P rotations, with the directions of the translations eliminated.
+
+    Attributes:
+        H: (P, 3, 3) and gradient: (P, 3).
+        cost: (P,) robust cost; squares: (P,) robustly weighted squares.
+        trust: (P, M) weights of the points after this evaluation, for the next.
+    """
+
+    H: Array
+    gradient: Array
+    cost: Array
+    squares: Array
+    trust: Array
+
+
+def normal_equations(
+    R: Array, b1: Array, b2: Array, weight: Array, sigma: Array | float, trust: Array
+) -> EpipolarEquations:
+    """Linearise at rotations R (P, 3, 3).
+
+    Args:
+        R: second camera into the first.
+        b1: (P, M, 3) unit vectors in the first camera; b2: in the second.
+        weight: (P, M), 0 where a point is not seen in both.
+        sigma: rad, of a bearing, one for all or (P, 1).
+        trust: (P, M) weights of the last evaluation, by which the directions are found; ``weight`` at first.
+    """
     Rb2 = b2 @ R.swapaxes(-1, -2)
     n = np.cross(b1, Rb2)
-    _, vectors = np.linalg.eigh((n * weight[..., None]).swapaxes(-1, -2) @ n)
+    _, vectors = np.linalg.eigh((n * trust[..., None]).swapaxes(-1, -2) @ n)
     t, sideways = vectors[..., 0], vectors[..., 1:]
     u = np.cross(t[:, None], b1)
     length = np.sqrt((u**2).sum(-1) + (np.cross(t[:, None], Rb2) ** 2).sum(-1)) + 1e-9
@@ -87,4 +121,4 @@ def normal_equations(R: Array, b1: Array, b2: Array, weight: Array, sigma: float
     H = full[:, :3, :3] - gain @ full[:, 3:, :3]
     gradient = gradient[:, :3] - (gain @ gradient[:, 3:, None])[..., 0]
     cost = (weight * np.log1p((e / _CAUCHY) ** 2)).sum(axis=1)
-    return H, gradient, cost, (robust * e**2).sum(axis=1)
+    return EpipolarEquations(H=H, gradient=gradient, cost=cost, squares=(robust * e**2).sum(axis=1), trust=robust)
