@@ -29,6 +29,8 @@ _AGREE_M, _AGREE_RAD = 0.5, np.radians(4.0)
 _AGREE_WITHIN_NS = 5 * NANOSECONDS
 # Keyframes from which the points of a keyframe are triangulated: about two seconds.
 _RECENT_KEYFRAMES = 10
+# Yaw that an odometry may have lost at worst.
+_YAW_DRIFT = np.radians(30.0)
 # Keyframes on both sides of a candidate that show the same place.
 _SAME_PLACE_KEYFRAMES = 3
 
@@ -227,8 +229,9 @@ class BowLoop(LoopCloser):
             return []
         before = similarity[-1] if self._places[-1].node >= first else similarity.max()
         youngest_ns = stamp_ns - round(options.exclude_s * NANOSECONDS)
-        old = np.array([place.node < first or place.stamp_ns <= youngest_ns for place in self._places])
-        similarity = np.where(old, similarity, 0.0)
+        node = np.array([place.node for place in self._places])
+        old = np.array([place.stamp_ns for place in self._places]) <= youngest_ns
+        similarity = np.where((old | (node < first)) & self._is_in_reach()[node], similarity, 0.0)
         chosen: list[int] = []
         while len(chosen) < options.candidates:
             best = int(similarity.argmax())
@@ -237,6 +240,17 @@ class BowLoop(LoopCloser):
             chosen.append(best)
             similarity[max(best - _SAME_PLACE_KEYFRAMES, 0) : best + _SAME_PLACE_KEYFRAMES + 1] = 0.0
         return chosen
+
+    def _is_in_reach(self) -> np.ndarray:
+        """Whether the newest keyframe may see what each keyframe (N,) saw, wherever the odometry has drifted to."""
+        options, trajectory = self._verification, self._ready()
+        if not trajectory.is_in_map:
+            return np.ones(len(trajectory), dtype=bool)
+        distance, turn = trajectory.apart_from_newest()
+        drift_m = options.max_drift_m + options.max_drift * trajectory.ways()
+        reach: np.ndarray = distance < options.max_distance_m + drift_m
+        reach &= turn < np.radians(options.max_yaw_deg) + _YAW_DRIFT
+        return reach
 
     def _is_plausible(self, place: _Place, keyframe: LoopKeyframe, T_world_loop: Array, node: int) -> bool:
         """Whether gravity, the distance of the views and the drift of the odometry allow a match."""
@@ -256,7 +270,7 @@ class BowLoop(LoopCloser):
             return self._is_confirmed(keyframe.stamp_ns, yaw, offset, keyframe.T_world_body[:3, 3])
         here = so3.rotation_z(yaw) @ keyframe.T_world_body[:3, 3] + offset
         moved = np.linalg.norm(here - trajectory.T_map_body[node][:3, 3])
-        return bool(moved <= options.max_drift_m + options.max_drift * trajectory.way(place.node, node))
+        return bool(moved <= options.max_drift_m + options.max_drift * trajectory.ways()[place.node])
 
     def _is_confirmed(self, stamp_ns: int, yaw: float, offset: Array, position: Array) -> bool:
         """Whether the last match with the loaded map said the same about where this sequence lies in it."""

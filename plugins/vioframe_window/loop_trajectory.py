@@ -85,10 +85,18 @@ class KeyframeTrajectory:
         known = own[rows] == stamps_ns
         self.T_world_body[self.first + rows[known]] = T_world_body[known]
 
-    def way(self, start: int, end: int) -> float:
-        """Metres of odometry from one keyframe to another; from a map's keyframe, since the sequence began."""
-        position = self.T_world_body[max(start, self.first) : end + 1, :3, 3]
-        return float(np.linalg.norm(np.diff(position, axis=0), axis=1).sum())
+    def ways(self) -> Array:
+        """Metres of odometry (N,) from each keyframe to the newest; from a map's, since the sequence began."""
+        own = self.T_world_body[self.first :, :3, 3]
+        steps = np.linalg.norm(np.diff(own, axis=0), axis=1)
+        ahead = np.concatenate([np.cumsum(steps[::-1])[::-1], np.zeros(min(len(own), 1))])
+        return np.concatenate([np.full(self.first, ahead[0] if len(ahead) else 0.0), ahead])
+
+    def apart_from_newest(self) -> tuple[Array, Array]:
+        """Distance (N,) m in the map, and turn (N,) rad about gravity, of each keyframe from the newest."""
+        T_map_body = self.T_map_body
+        distance = np.linalg.norm(T_map_body[:, :3, 3] - T_map_body[-1, :3, 3], axis=1)
+        return distance, np.abs(graph.yaw_of(T_map_body[:, :3, :3] @ T_map_body[-1, :3, :3].T))
 
     def implied_correction(self, start: int, T_start_world: Array) -> tuple[float, Array]:
         """Yaw and offset that the present odometry frame would have if it lay at (4, 4) in the body ``start``."""

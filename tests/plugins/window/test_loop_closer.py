@@ -95,7 +95,7 @@ def test_a_place_that_looks_the_same_but_is_built_otherwise_is_refused() -> None
 def test_a_copy_of_a_room_too_far_away_is_refused() -> None:
     path = circle(0.35)
     away = path.copy()
-    away[:, :3, 3] += (60.0, 0.0, 0.0)
+    away[:, :3, 3] += (25.0, 0.0, 0.0)
     world = PointWorld.around(path, 5)
     truth, odometry = np.concatenate([path, path]), np.concatenate([path, away])
     loop = BowLoop(retrieval=Retrieval(exclude_s=5.0))
@@ -106,7 +106,7 @@ def test_a_copy_of_a_room_too_far_away_is_refused() -> None:
             # The way to the copy is long, but not as long as it would have to be.
             for step in range(1, 10):
                 middle = T_odometry.copy()
-                middle[:3, 3] += (step - 10) * np.array([6.0, 0.0, 0.0])
+                middle[:3, 3] += (step - 10) * np.array([2.5, 0.0, 0.0])
                 blind = LoopKeyframe(
                     stamp_ns=index * STEP_NS - 10 + step,
                     T_world_body=middle,
