@@ -70,6 +70,7 @@ class Alignment:
 
     Attributes:
         scale: metres per unit of the path; negative where force and path contradict each other in sign.
+        scale_sigma: its standard deviation, for the stated uncertainty of the path.
         velocity: (3,) m/s.
         gravity: (3,) m/s², of the known magnitude, pointing down.
         accel_bias: (3,) m/s².
@@ -78,6 +79,7 @@ class Alignment:
     """
 
     scale: float
+    scale_sigma: float
     velocity: Array
     gravity: Array
     accel_bias: Array
@@ -203,6 +205,7 @@ def align(
     residual = A[:, :4] @ z[:4] + A[:, 4:7] @ g + A[:, 7:] @ z[7:] - b
     return Alignment(
         scale=float(z[0]),
+        scale_sigma=path_sigma * float(np.sqrt(max(np.linalg.pinv(N)[0, 0], 0.0))),
         velocity=z[1:4],
         gravity=g,
         accel_bias=z[7:],

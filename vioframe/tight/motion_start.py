@@ -51,6 +51,8 @@ _DELAY_SIGMAS = 3.0
 _LEAST_DELAY_S = 0.008
 _DELAY_EXPLAINS = 0.7
 _MOST_ROTATION_SIGMA_DEG = 1.0
+# The sign of the scale is believed beyond this many standard deviations.
+_SIGN_SIGMAS = 4.0
 
 
 class MotionStart:
@@ -71,6 +73,11 @@ class MotionStart:
         self._sigma = options.pixel_sigma / float(rig.cameras[0].intrinsics_px[0])
         self._tried_ns: int | None = None
         self._before: SolvedPath | None = None
+
+    @property
+    def solved(self) -> SolvedPath | None:
+        """The path that the last attempt found, if it got that far."""
+        return self._before
 
     def clear(self) -> None:
         """Forget what was seen."""
@@ -260,11 +267,17 @@ class MotionStart:
             f"only {path.ahead:.0%} of the points lie ahead of the cameras that see them: check the order of the "
             "cameras and the sign of their axes",
         )
-        if alignment.scale <= 0.0:
+        if alignment.scale < -_SIGN_SIGMAS * alignment.scale_sigma:
             examination.blame(
                 doctor.GRAVITY_SIGN,
                 f"the accelerometer and the images move in opposite directions (scale {alignment.scale:.2g}): it must "
                 "read +g upwards at rest; turn the sign of its samples",
+            )
+        elif alignment.scale <= 0.0:
+            examination.blame(
+                doctor.SCALE,
+                f"the scale is not known, not even its sign ({alignment.scale:.2g} ± {alignment.scale_sigma:.2g}): "
+                "accelerate more, sideways and up and down",
             )
         examination.at_most(
             "gravity residual",
