@@ -292,7 +292,9 @@ class BowLoop(LoopCloser):
         T_world_loop = keyframe.T_world_body @ T_body_loop
         if place.node < trajectory.first and not trajectory.is_in_map:
             trajectory.move_into_map(*trajectory.implied_correction(place.node, se3.inverse(T_world_loop)))
-        number = trajectory.match(place.node, node, se3.inverse(T_body_loop))
+        number = trajectory.match(
+            place.node, node, se3.inverse(T_body_loop), sigma_rad=found.sigma_rad, sigma_m=found.sigma_m
+        )
         self._count("loop closures")
         held = np.isin(ids[found.points], keyframe.landmark_ids)
         points, corners = found.points[held], found.corners[held]

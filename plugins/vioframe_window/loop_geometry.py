@@ -16,6 +16,8 @@ _MIN_COSINE = 0.2
 _CONFIDENCE = 0.999
 _FEWEST_FOR_POSE = 6
 _REFINE_ROUNDS = 2
+# A corner is never known better than this.
+_NOISE_PX = 0.7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -25,11 +27,14 @@ class Found:
     Attributes:
         T_points_cam: (4, 4) pose of the other camera in the frame of the points.
         points: (N,) rows of the points that agree, and corners: (N,) rows of the other's corners they were found at.
+        sigma_m, sigma_rad: standard deviation of the pose, an axis, as far as the corners' scatter tells.
     """
 
     T_points_cam: Array
     points: np.ndarray
     corners: np.ndarray
+    sigma_m: float
+    sigma_rad: float
 
 
 def locate(
@@ -71,7 +76,15 @@ def locate(
     agree = (apart[rows, columns] < options.inlier_px) & (depth[rows] > 0.0)
     if agree.sum() < options.min_matches:
         return None
-    return Found(T_points_cam=se3.inverse(T_cam_points), points=rows[agree], corners=ahead[columns[agree]])
+    rows, columns = rows[agree], columns[agree]
+    sigma_rad, sigma_m = _sigmas(se3.transform(T_cam_points, points[rows]), apart[rows, columns], focal_px)
+    return Found(
+        T_points_cam=se3.inverse(T_cam_points),
+        points=rows,
+        corners=ahead[columns],
+        sigma_m=sigma_m,
+        sigma_rad=sigma_rad,
+    )
 
 
 def _mutual(distance: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
@@ -90,6 +103,21 @@ def _errors(T_cam_points: Array, points: Array, image: Array, focal_px: float) -
     depth = seen[:, 2]
     projected = focal_px * seen[:, :2] / np.where(np.abs(depth) < 1e-6, 1e-6, depth)[:, None]
     return np.linalg.norm(projected[:, None] - image[None], axis=2), depth
+
+
+def _sigmas(seen: Array, errors_px: Array, focal_px: float) -> tuple[float, float]:
+    """Standard deviations, rad and m an axis, of a camera that sees points (N, 3) at these distances (N,) px."""
+    x, y, depth = seen.T
+    zero = np.zeros_like(depth)
+    by_point = (focal_px / depth)[:, None, None] * np.stack(
+        [np.stack([zero + 1.0, zero, -x / depth], axis=1), np.stack([zero, zero + 1.0, -y / depth], axis=1)], axis=1
+    )
+    # A turn of the camera about itself moves a point by −[q]×, a step by the step.
+    jacobian = np.concatenate([-by_point @ so3.hat(seen), by_point], axis=2).reshape(-1, 6)
+    noise_px = max(float(np.sqrt(0.5 * np.mean(errors_px**2))), _NOISE_PX)
+    covariance = noise_px**2 * np.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
+    spread = np.sqrt(np.diag(covariance).reshape(2, 3).mean(axis=1))
+    return float(spread[0]), float(spread[1])
 
 
 def _pose_by_samples(points: Array, image: Array, focal_px: float, options: Verification, seed: int) -> Array | None:

@@ -139,27 +139,25 @@ def odometry_edges(T_world_body: Array, order: np.ndarray, broken: np.ndarray, o
     )
 
 
-def match_edges(start: np.ndarray, end: np.ndarray, T_start_end: Array, R: Array, options: GraphOptions) -> Edges:
+def match_edges(start: np.ndarray, end: np.ndarray, T_start_end: Array, sigmas: Array, R: Array) -> Edges:
     """Matches.
 
     Args:
         start, end: (M,) nodes.
         T_start_end: (M, 4, 4) pose of one body in the other's frame.
+        sigmas: (M, 2) rad and m an axis.
         R: (N, 3, 3) rotations of the odometry.
-        options: sigmas.
     """
-    count = len(start)
     R_end_start = R[end] @ np.swapaxes(T_start_end[:, :3, :3], -1, -2)
     turn = yaw_of(R[start] @ np.swapaxes(R_end_start, -1, -2))
     apart = (R_end_start @ T_start_end[:, :3, 3:])[..., 0]
-    sigmas = np.array([np.radians(options.match_sigma_yaw_deg), *[options.match_sigma_m] * 3])
     return Edges(
         start=start,
         end=end,
         displacement=_turn_back(-turn, apart),
         turn=turn,
-        root=np.tile(1.0 / sigmas, (count, 1)),
-        robust=np.ones(count, dtype=bool),
+        root=1.0 / sigmas[:, [0, 1, 1, 1]],
+        robust=np.ones(len(start), dtype=bool),
     )
 
 

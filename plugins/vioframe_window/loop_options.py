@@ -126,8 +126,8 @@ class GraphOptions:
         step_sigma_m: of a step of one keyframe, an axis.
         step_sigma_share: of its length, added to that.
         step_sigma_yaw_deg: of a step.
-        match_sigma_m: of a match, an axis.
-        match_sigma_yaw_deg: of a match.
+        match_sigma_m: of a match, an axis, beside what its points tell.
+        match_sigma_yaw_deg: of a match, likewise.
         huber: multiple of these from which a match counts linearly instead of squared.
         interrupted: factor on the sigmas of a step during which the odometry started again.
         iterations: most Gauss–Newton steps at a time.

@@ -1,6 +1,6 @@
 """The remembered keyframes in both frames: the odometry's poses, the matches between them, and the correction."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,14 +9,24 @@ from vioframe.geometry import se3, so3
 from vioframe_window import loop_graph as graph
 from vioframe_window.loop_options import GraphOptions
 
+# Points that are a little wrong together, as triangulated ones are, are worse than the scatter of their corners tells.
+_CAUTION = 3.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Match:
-    """A keyframe seen from another: nodes, and the pose (4, 4) of the later body in the frame of the earlier."""
+    """A keyframe seen from another.
+
+    Attributes:
+        start, end: nodes.
+        T_start_end: (4, 4) pose of the later body in the frame of the earlier.
+        sigmas: (2,) rad and m an axis.
+    """
 
     start: int
     end: int
     T_start_end: Array
+    sigmas: Array
 
 
 class KeyframeTrajectory:
@@ -114,19 +124,26 @@ class KeyframeTrajectory:
         self._offset[self.first :] = self._offset[self.first :] @ turn.T + offset
         self.is_in_map = True
 
-    def match(self, start: int, end: int, T_start_end: Array) -> int:
-        """Number of a new match, which the correction takes into account at once where it is off."""
+    def match(self, start: int, end: int, T_start_end: Array, *, sigma_rad: float = 0.0, sigma_m: float = 0.0) -> int:
+        """Number of a new match, which the correction takes into account at once where it is off.
+
+        Args:
+            start, end: keyframes.
+            T_start_end: (4, 4).
+            sigma_rad, sigma_m: of it, an axis, which the options' are added to.
+        """
         number = self._next_match
         self._next_match += 1
-        self._matches[number] = Match(start=start, end=end, T_start_end=T_start_end)
+        least = np.array([np.radians(self._options.match_sigma_yaw_deg), self._options.match_sigma_m])
+        sigmas = np.hypot(least, _CAUTION * np.array([sigma_rad, sigma_m]))
+        self._matches[number] = Match(start=start, end=end, T_start_end=T_start_end, sigmas=sigmas)
         self._take(number)
         return number
 
     def refine(self, number: int, T_start_end: Array) -> None:
         """Replace the pose of a match; one that has been forgotten passes."""
         if number in self._matches:
-            old = self._matches[number]
-            self._matches[number] = Match(start=old.start, end=old.end, T_start_end=T_start_end)
+            self._matches[number] = replace(self._matches[number], T_start_end=T_start_end)
             self._take(number)
 
     def _take(self, number: int) -> None:
@@ -159,8 +176,8 @@ class KeyframeTrajectory:
             np.array([match.start for match in matches]),
             np.array([match.end for match in matches]),
             np.array([match.T_start_end for match in matches]),
+            np.array([match.sigmas for match in matches]),
             self.T_world_body[:, :3, :3],
-            self._options,
         )
 
     def correction_at(self, stamps_ns: Stamps) -> Array:
@@ -188,7 +205,6 @@ class KeyframeTrajectory:
         self.stamps_ns, self.T_world_body = self.stamps_ns[kept], self.T_world_body[kept]
         self._yaw, self._offset, self._order = self._yaw[kept], self._offset[kept], self._order[kept]
         self._matches = {
-            key: Match(start=int(number[m.start]), end=int(number[m.end]), T_start_end=m.T_start_end)
-            for key, m in self._matches.items()
+            key: replace(m, start=int(number[m.start]), end=int(number[m.end])) for key, m in self._matches.items()
         }
         return number

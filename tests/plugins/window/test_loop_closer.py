@@ -92,6 +92,25 @@ def test_a_place_that_looks_the_same_but_is_built_otherwise_is_refused() -> None
     assert locate(seen[rng.permutation(80)], descriptors, other, 400.0, Verification(), seed=0) is None
 
 
+def test_a_pose_is_as_sure_as_it_says() -> None:
+    """Over many noisy pictures of one scene, the camera scatters as its sigmas say."""
+    rng = np.random.default_rng(10)
+    points = rng.uniform((-2.0, -1.5, 3.0), (2.0, 1.5, 8.0), (60, 3))
+    descriptors = rng.integers(0, 256, (60, 32), dtype=np.uint8)
+    apart, sigmas = [], []
+    for _ in range(60):
+        noisy = points[:, :2] / points[:, 2:] + 1.0 / 400.0 * rng.standard_normal((60, 2))
+        bearings = np.column_stack([noisy, np.ones(60)])
+        bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+        other = Appearance(ids=np.arange(60), pixels=np.zeros((60, 2)), bearings=bearings, descriptors=descriptors)
+        found = locate(points, descriptors, other, 400.0, Verification(inlier_px=6.0), seed=0)
+        assert found is not None
+        apart.append([so3.angle(found.T_points_cam[:3, :3]), np.linalg.norm(found.T_points_cam[:3, 3])])
+        sigmas.append([found.sigma_rad, found.sigma_m])
+    scatter = np.sqrt(np.mean(np.square(apart), axis=0) / 3.0)
+    np.testing.assert_allclose(scatter, np.mean(sigmas, axis=0), rtol=0.25)
+
+
 def test_a_copy_of_a_room_too_far_away_is_refused() -> None:
     path = circle(0.35)
     away = path.copy()
