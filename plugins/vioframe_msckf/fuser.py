@@ -23,7 +23,11 @@ from vioframe_msckf.track_update import Linearised, chi_squares, information, li
 from vioframe_msckf.triangulation import in_front, triangulate, widest_parallax
 
 # Images are stamped with a new delay in steps of at most this, so that no stamp goes back.
-_DELAY_STEP_S = 0.005
+_DELAY_STEP_S = 0.01
+# The rate at an image is the mean over so long before it.
+_RATE_NS = 30_000_000
+# rad/s of it that idling motors make (EuRoC).
+_VIBRATION = 0.1
 
 
 class MsckfFuser(TightFuser):
@@ -124,20 +128,18 @@ class MsckfFuser(TightFuser):
         used = refused = 0
         at_rest = False
         self._table.begin_image()
-        if not len(step.tracks):
-            self._drop_lost_landmarks(np.zeros(len(state.points), dtype=bool))
-        else:
-            self._add_clone(step)
-            at_rest = step.at_rest and len(state.p_clones) > 1 and measure_standstill(state, self._standstill)
-            if at_rest:
-                self._table.keep_alive(step.tracks.ids)
-            else:
-                used, refused = self._see(step)
-        more_used, more_refused = self._use_up_tracks()
+        if step.at_rest and len(state.p_clones) > 0:
+            at_rest = measure_standstill(state, self._standstill)
         if at_rest:
             # Another clone of the same place would push out those that have parallax.
-            state.drop_clone(len(state.p_clones) - 1)
-        elif len(state.p_clones) > self._points.clones:
+            self._table.keep_alive(step.tracks.ids)
+        elif len(step.tracks):
+            self._add_clone(step)
+            used, refused = self._see(step)
+        else:
+            self._drop_lost_landmarks(np.zeros(len(state.points), dtype=bool))
+        more_used, more_refused = self._use_up_tracks()
+        if len(state.p_clones) > self._points.clones:
             state.drop_clone(0)
             self._table.drop_column(0)
         state.tidy()
@@ -149,7 +151,12 @@ class MsckfFuser(TightFuser):
 
     def _add_clone(self, step: Step) -> None:
         body = self._state.body
-        rate = step.window.imu.gyro[-1] - body.bias.gyro
+        # The rate is the delay's regressor, and noise in a regressor makes sure of zero: average, and shrink what
+        # may be vibration (James & Stein 1961).
+        imu = step.window.imu
+        recent = imu.stamps_ns >= imu.stamps_ns[-1] - _RATE_NS
+        rate = imu.gyro[recent].mean(axis=0) - body.bias.gyro
+        rate = rate * max(0.0, 1.0 - _VIBRATION**2 / max(float(rate @ rate), 1e-12))
         later_s = self._state.delay_s - step.window.camera_delay_ns / NANOSECONDS
         self._state.add_clone(later_s, rate)
 
@@ -197,7 +204,8 @@ class MsckfFuser(TightFuser):
         if not len(sightings.index):
             return 0, 0
         limit = self._points.landmark_gate * self._limits[2]
-        fits = correct_by_sightings(self._state, sightings, limit, self._points.min_depth_m)
+        gate_noise = (self._points.sigma_px / self._points.landmark_sigma_px) ** 2
+        fits = correct_by_sightings(self._state, sightings, limit, self._points.min_depth_m, gate_noise)
         ids = self._state.point_ids[sightings.index]
         bad = set(ids[~fits].tolist())
         self._misses = {key: self._misses.get(key, 0) + 1 for key in bad}
@@ -288,6 +296,8 @@ class MsckfFuser(TightFuser):
         """Take tracks that span all clones with enough parallax into the state."""
         table, state, options = self._table, self._state, self._points
         spans = (weights[:, 0] > 0.0).all(axis=1) & table.seen[rows]
+        # A point that slides along an edge passes the gate of a track, but would bend the scale for long.
+        spans &= tracks.squares <= self._limits[(tracks.rows - 3.0).astype(np.int64)]
         parallax = widest_parallax(R, points, weights.reshape(len(rows), -1), anchors)
         wanted = np.flatnonzero(spans & (parallax > np.deg2rad(options.landmark_parallax_deg)))
         free = options.landmarks - len(state.points)

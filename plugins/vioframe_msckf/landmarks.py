@@ -30,13 +30,16 @@ class Sightings:
     weights: Array
 
 
-def correct_by_sightings(state: FilterState, sightings: Sightings, limit: float, nearest_m: float) -> Mask:
+def correct_by_sightings(
+    state: FilterState, sightings: Sightings, limit: float, nearest_m: float, gate_noise: float = 1.0
+) -> Mask:
     """Correct by all sightings that fit one by one; say which did, (m,).
 
     Args:
         state: its newest clone is the image's.
         sightings: at most one a point and camera.
         limit: largest χ² of a sighting that is used.
+        gate_noise: variance of a sighting's noise that the gate assumes, in units of what the correction assumes.
         nearest_m: a point that comes nearer than this to the camera, or behind it, does not fit.
     """
     f = state.points[sightings.index]
@@ -68,7 +71,8 @@ def correct_by_sightings(state: FilterState, sightings: Sightings, limit: float,
     S[np.diag_indices_from(S)] += 1.0
 
     each = np.arange(len(f))
-    blocks = S.reshape(len(f), 2, len(f), 2)[each, :, each]
+    # Slow drift of a tracker is noise that a correction must not count often, yet no excuse for an outlier.
+    blocks = S.reshape(len(f), 2, len(f), 2)[each, :, each] - (1.0 - gate_noise) * np.eye(2)
     chi = (residual * np.linalg.solve(blocks, residual[..., None])[..., 0]).sum(axis=-1)
     good = chi < limit
     if good.any():

@@ -27,9 +27,9 @@ class PointOptions:
     """
 
     sigma_px: float = 0.7
-    landmark_sigma_px: float = 2.0
+    landmark_sigma_px: float = 3.0
     clones: int = 15
-    landmarks: int = 40
+    landmarks: int = 30
     tracks_per_frame: int = 60
     min_observations: int = 4
     track_gate: float = 6.0

@@ -6,30 +6,33 @@ from vioframe.error_state import THETA, VELOCITY
 from vioframe.fusion_options import StandstillOptions
 from vioframe.geometry import se3, so3
 from vioframe_msckf.correction import correct_by_residuals
-from vioframe_msckf.state import FilterState
+from vioframe_msckf.state import CLONES, DELAY, FilterState
 
 
 def measure_standstill(state: FilterState, options: StandstillOptions) -> bool:
-    """Measure that the camera stands where the clone before the newest one was taken, and has no velocity.
+    """Measure that the camera stands where the newest clone was taken, and has no velocity.
 
-    The reference stays the same as long as the body rests, so the position does not walk however long that is.
+    The reference stays the same as long as the body rests, so the position does not walk however long that is. When
+    exactly an image of a rest was taken makes no difference, and must not: the rate of a body that rests is
+    vibration, from which the filter would otherwise learn a delay.
 
     Args:
-        state: with two clones or more; the newest is the present.
+        state: with one clone or more.
         options: how sharp; a contradiction is not used.
 
     Returns:
         Whether it was used.
     """
-    newest, before = state.clone_errors.stop - 6, state.clone_errors.stop - 12
-    T_new = se3.from_parts(state.R_clones[-1], state.p_clones[-1])
-    T_before = se3.from_parts(state.R_clones[-2], state.p_clones[-2])
+    reference = slice(state.clone_errors.stop - 6, state.clone_errors.stop)
+    T_before = se3.from_parts(state.R_clones[-1], state.p_clones[-1])
+    T_new, J = state.camera_pose(0.0, np.zeros(3))
+    J[:, DELAY] = 0.0
     H = np.zeros((9, len(state.covariance)))
     residual = np.zeros(9)
     residual[:6] = se3.log(se3.inverse(T_new) @ T_before)
     back = se3.adjoint(se3.inverse(T_new))
-    H[:6, newest : newest + 6] = back
-    H[:6, before : before + 6] = -back
+    H[:6, :CLONES] = back @ J
+    H[:6, reference] = -back
     residual[6:] = -state.body.v
     H[6:, VELOCITY] = np.eye(3)
     H[6:, THETA] = -so3.hat(state.body.v)
