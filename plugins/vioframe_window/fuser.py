@@ -144,7 +144,7 @@ class WindowFuser(TightFuser):
         return trajectory if self._loop is None else self._loop.correct(trajectory)
 
     def _begin(self, start: Start) -> None:
-        from vioframe_window.smoother import Calibration
+        from vioframe_window.graph_writer import Calibration
 
         options = self._calibration
         camera = self._rig.cameras[0]

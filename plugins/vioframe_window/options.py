@@ -31,7 +31,7 @@ class WindowOptions:
     sparse_below: float = 0.5
     iterations: int = 1
     relinearise_above: float = 0.005
-    covariance_every: int = 2
+    covariance_every: int = 3
 
     def __post_init__(self) -> None:
         _check_positive(
@@ -64,7 +64,7 @@ class LandmarkOptions:
         huber: multiple of ``sigma_px`` from which an observation counts linearly instead of squared.
     """
 
-    most: int = 100
+    most: int = 90
     most_new: int = 30
     min_views: int = 3
     min_parallax_deg: float = 1.0
@@ -72,7 +72,7 @@ class LandmarkOptions:
     min_depth: float = 0.2
     max_depth: float = 60.0
     sigma_px: float = 0.5
-    huber: float = 1.345
+    huber: float = 2.0
 
     def __post_init__(self) -> None:
         _check_positive(

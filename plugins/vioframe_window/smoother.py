@@ -9,7 +9,7 @@ written in Python, and the many projections stay gtsam's own. Variables older th
 
 import logging
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import SupportsFloat, SupportsIndex, SupportsInt
 
 import gtsam
@@ -21,37 +21,15 @@ from vioframe.fusion_options import StandstillOptions
 from vioframe.geometry import se3, so3
 from vioframe.types import Camera, ImuBias, NavState
 from vioframe_window import factors
+from vioframe_window.graph_writer import Calibration, GraphWriter
 from vioframe_window.keyframes import Keyframe, focal_length
 from vioframe_window.options import LandmarkOptions, WindowOptions
 from vioframe_window.triangulation import gather, reprojection_errors
 
 log = logging.getLogger(__name__)
 
-# Observations are normalised coordinates, so that any lens is a pinhole of focal length 1.
-_CALIBRATION = gtsam.Cal3_S2()
-# Sigma, m, of the part of a relative pose that was not measured.
-_NO_MEASUREMENT = 1e3
 # Fewer points do not say where an old image was taken.
 _FEWEST_SEEN_AGAIN = 6
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Calibration:
-    """What is assumed of the cameras' place and delay before the first image.
-
-    Attributes:
-        T_body_cam: (4, 4) of camera 0.
-        sigmas: (6,) of it, tangent order; below a microradian and micrometre it is taken as fixed.
-        delay_s: of the camera.
-        delay_sigma: s, or None where the delay is not estimated.
-        is_estimated: whether extrinsics or delay are variables.
-    """
-
-    T_body_cam: Array
-    sigmas: Array
-    delay_s: float
-    delay_sigma: float | None
-    is_estimated: bool
 
 
 class Smoother:
@@ -71,17 +49,10 @@ class Smoother:
         landmarks: LandmarkOptions,
         standstill: StandstillOptions,
     ) -> None:
-        self._cameras = cameras
         self._window = window
         self._landmarks = landmarks
         self._focal_px = focal_length(cameras[0])
-        self._T_cam0_camera = [se3.inverse(cameras[0].T_body_cam) @ camera.T_body_cam for camera in cameras]
-        pixel = gtsam.noiseModel.Isotropic.Sigma(2, landmarks.sigma_px / self._focal_px)
-        self._pixel = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(landmarks.huber), pixel)
-        self._no_motion = gtsam.noiseModel.Diagonal.Sigmas(
-            np.repeat([standstill.rotation_sigma, standstill.position_sigma], 3)
-        )
-        self._no_speed = gtsam.noiseModel.Isotropic.Sigma(3, standstill.velocity_sigma)
+        self._writer = GraphWriter(cameras, landmarks, standstill)
 
     @property
     def newest(self) -> Keyframe:
@@ -96,16 +67,16 @@ class Smoother:
     @property
     def T_body_cam(self) -> Array:
         """Camera 0 on the body, (4, 4), as estimated now."""
-        return self._calibration.T_body_cam
+        return self._writer.calibration.T_body_cam
 
     @property
     def delay_s(self) -> float:
         """The camera's delay as estimated now."""
-        return self._calibration.delay_s
+        return self._writer.calibration.delay_s
 
     def camera_poses(self, T_world_cam: Array) -> Array:
         """All cameras of the rig (C, 4, 4) in the world, of camera 0's pose."""
-        return np.stack([T_world_cam @ T for T in self._T_cam0_camera])
+        return np.stack([T_world_cam @ T for T in self._writer.T_cam0_camera])
 
     def begin(self, keyframe: Keyframe, state: NavState, covariance: Array, calibration: Calibration) -> None:
         """Forget everything; start from one keyframe.
@@ -116,7 +87,7 @@ class Smoother:
             covariance: (15, 15) of it.
             calibration: of the camera.
         """
-        self._calibration = calibration
+        self._writer.calibration = calibration
         self.keyframes: list[Keyframe] = [keyframe]
         self.point_ids: Stamps = np.zeros(0, dtype=np.int64)
         self.points_world: Array = np.zeros((0, 3))
@@ -144,16 +115,16 @@ class Smoother:
         """
         graph, values = self._waiting
         self._waiting = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        self._add_motion(graph, values, keyframe, self.newest)
+        self._writer.add_motion(graph, values, keyframe, self.newest)
         self.keyframes.append(keyframe)
         for camera, rows in observed.items():
             view = keyframe.views[camera]
             for row in rows:
-                self._observe(graph, keyframe, camera, int(view.ids[row]), view.points[row])
+                self._writer.observe(graph, keyframe, camera, int(view.ids[row]), view.points[row])
         for track_id, point in zip(new_ids.tolist(), new_points, strict=True):
             values.insert(factors.point_key(track_id), point)
             for past in self.keyframes:
-                self._observe_if_seen(graph, past, track_id)
+                self._writer.observe_if_seen(graph, past, track_id)
         self._hold(new_ids, new_points)
         seen = np.isin(self.point_ids, np.concatenate([view.ids for view in keyframe.views]))
         self._point_stamps_ns[seen] = keyframe.stamp_ns
@@ -182,12 +153,7 @@ class Smoother:
         graph, values = self._waiting
         values.insert(factors.loop_key(match_id), gtsam.Pose3(T_world_cam))
         for row in held.tolist():
-            key = factors.point_key(int(ids[row]))
-            graph.push_back(
-                gtsam.GenericProjectionFactorCal3_S2(
-                    points[row], self._pixel, factors.loop_key(match_id), key, _CALIBRATION
-                )
-            )
+            self._writer.observe_from_loop(graph, match_id, int(ids[row]), points[row])
         self.loop_cameras[match_id] = T_world_cam
         return True
 
@@ -203,21 +169,21 @@ class Smoother:
 
     def _kept_alive(self) -> dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex]:
         """Stamps of the variables that never leave the window."""
-        if not self._calibration.is_estimated:
+        if not self._writer.calibration.is_estimated:
             return {}
-        keys = [factors.EXTRINSICS, *([] if self._calibration.delay_sigma is None else [factors.DELAY])]
+        keys = [factors.EXTRINSICS, *([factors.DELAY] if self._writer.has_delay else [])]
         return dict.fromkeys(keys, self._time(self.newest.stamp_ns))
 
     def _read(self) -> None:
         """Refresh every estimate; forget what was marginalised."""
         values = self._solver.calculateEstimate()
-        estimated = self._calibration.is_estimated
+        estimated = self._writer.calibration.is_estimated
         if estimated:
             T_body_cam = values.atPose3(factors.EXTRINSICS).matrix()
-            delay_s = self._calibration.delay_s
-            if self._calibration.delay_sigma is not None:
+            delay_s = self._writer.calibration.delay_s
+            if self._writer.has_delay:
                 delay_s = float(values.atVector(factors.DELAY)[0])
-            self._calibration = replace(self._calibration, T_body_cam=T_body_cam, delay_s=delay_s)
+            self._writer.calibration = replace(self._writer.calibration, T_body_cam=T_body_cam, delay_s=delay_s)
         self.keyframes = [k for k in self.keyframes if values.exists(factors.body_key(k.index))]
         for keyframe in self.keyframes:
             keyframe.T_world_body = values.atPose3(factors.body_key(keyframe.index)).matrix()
@@ -270,18 +236,8 @@ class Smoother:
         self._solver = gtsam.IncrementalFixedLagSmoother(self._window.lag_s, parameters)
         first = self.keyframes[0]
         graph, values = factors.start_prior(first.index, state, covariance), gtsam.Values()
-        self._insert(values, first)
-        calibration = self._calibration
-        if calibration.is_estimated:
-            T_body_cam = gtsam.Pose3(calibration.T_body_cam)
-            values.insert(factors.EXTRINSICS, T_body_cam)
-            sigmas = gtsam.noiseModel.Diagonal.Sigmas(np.maximum(calibration.sigmas, 1e-6))
-            graph.push_back(gtsam.PriorFactorPose3(factors.EXTRINSICS, T_body_cam, sigmas))
-            if calibration.delay_sigma is not None:
-                values.insert(factors.DELAY, np.array([calibration.delay_s]))
-                sigma = gtsam.noiseModel.Isotropic.Sigma(1, calibration.delay_sigma)
-                graph.push_back(gtsam.PriorFactorVector(factors.DELAY, np.array([calibration.delay_s]), sigma))
-            self._tie(graph, first)
+        self._writer.add_calibration(graph, values)
+        self._writer.add_keyframe(graph, values, first)
         self._solver.update(graph, values, dict.fromkeys(values.keys(), self._time(first.stamp_ns)))
 
     def _rebuild_or_fail(self) -> None:
@@ -317,7 +273,7 @@ class Smoother:
         stamps: dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex] = {}
         for before, keyframe in zip(self.keyframes[:-1], self.keyframes[1:], strict=True):
             known = set(values.keys())
-            self._add_motion(graph, values, keyframe, before)
+            self._writer.add_motion(graph, values, keyframe, before)
             stamps.update(dict.fromkeys(set(values.keys()) - known, self._time(keyframe.stamp_ns)))
         for track_id, point, stamp_ns in zip(
             self.point_ids.tolist(), self.points_world, self._point_stamps_ns.tolist(), strict=True
@@ -325,7 +281,7 @@ class Smoother:
             values.insert(factors.point_key(track_id), point)
             stamps[factors.point_key(track_id)] = self._time(stamp_ns)
             for keyframe in self.keyframes:
-                self._observe_if_seen(graph, keyframe, track_id)
+                self._writer.observe_if_seen(graph, keyframe, track_id)
         stamps.update(self._kept_alive())
         self._solver.update(graph, values, stamps)
         self._solve(gtsam.NonlinearFactorGraph(), gtsam.Values(), self.point_ids[:0])
@@ -339,77 +295,13 @@ class Smoother:
         bad = seen & ((depths < self._landmarks.min_depth) | (errors > 3.0 * self._landmarks.max_error_px))
         return np.flatnonzero(~bad.any(axis=0) & (seen.sum(axis=0) >= 2))
 
-    def _add_motion(
-        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keyframe: Keyframe, before: Keyframe
-    ) -> None:
-        self._insert(values, keyframe)
-        i, j = before.index, keyframe.index
-        if keyframe.increment is not None:
-            poses, velocities = ([key(i), key(j)] for key in (factors.body_key, factors.velocity_key))
-            graph.push_back(
-                gtsam.CombinedImuFactor(
-                    poses[0],
-                    velocities[0],
-                    poses[1],
-                    velocities[1],
-                    factors.bias_key(i),
-                    factors.bias_key(j),
-                    keyframe.increment,
-                )
-            )
-        if keyframe.at_rest:
-            graph.push_back(
-                gtsam.BetweenFactorPose3(factors.body_key(i), factors.body_key(j), gtsam.Pose3(), self._no_motion)
-            )
-            graph.push_back(gtsam.PriorFactorVector(factors.velocity_key(j), np.zeros(3), self._no_speed))
-        if keyframe.turn is not None:
-            R_body_cam = self.T_body_cam[:3, :3]
-            turned = gtsam.Pose3(se3.from_parts(R_body_cam @ keyframe.turn.R_past_cam @ R_body_cam.T, np.zeros(3)))
-            sigmas = np.repeat([keyframe.turn.sigma, _NO_MEASUREMENT], 3)
-            noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-            graph.push_back(gtsam.BetweenFactorPose3(factors.body_key(i), factors.body_key(j), turned, noise))
-        if self._calibration.is_estimated:
-            self._tie(graph, keyframe)
-
     def predict(self, keyframe: Keyframe) -> None:
         """Fill in camera 0 of a new keyframe, by the present calibration."""
-        shift = self.delay_s - keyframe.delay_s if self._calibration.delay_sigma is not None else 0.0
+        shift = self.delay_s - keyframe.delay_s if self._writer.has_delay else 0.0
         moved = keyframe.T_world_body.copy()
         moved[:3, :3] = moved[:3, :3] @ so3.exp((keyframe.rate - keyframe.bias.gyro) * shift)
         moved[:3, 3] += keyframe.v_world_body * shift
         keyframe.T_world_cam = moved @ self.T_body_cam
-
-    def _insert(self, values: gtsam.Values, keyframe: Keyframe) -> None:
-        index = keyframe.index
-        values.insert(factors.body_key(index), gtsam.Pose3(keyframe.T_world_body))
-        values.insert(factors.velocity_key(index), keyframe.v_world_body)
-        values.insert(factors.bias_key(index), gtsam.imuBias.ConstantBias(keyframe.bias.accel, keyframe.bias.gyro))
-        if self._calibration.is_estimated:
-            values.insert(factors.camera_key(index), gtsam.Pose3(keyframe.T_world_cam))
-
-    def _tie(self, graph: gtsam.NonlinearFactorGraph, keyframe: Keyframe) -> None:
-        rate = keyframe.rate - keyframe.bias.gyro
-        with_delay = self._calibration.delay_sigma is not None
-        graph.push_back(factors.camera_tie(keyframe.index, rate, keyframe.delay_s, with_delay=with_delay))
-
-    def _observe_if_seen(self, graph: gtsam.NonlinearFactorGraph, keyframe: Keyframe, track_id: int) -> None:
-        for camera, view in enumerate(keyframe.views):
-            row = int(np.searchsorted(view.ids, track_id))
-            if row < len(view.ids) and view.ids[row] == track_id:
-                self._observe(graph, keyframe, camera, track_id, view.points[row])
-
-    def _observe(
-        self, graph: gtsam.NonlinearFactorGraph, keyframe: Keyframe, camera: int, track_id: int, point: Array
-    ) -> None:
-        if self._calibration.is_estimated:
-            key, place = factors.camera_key(keyframe.index), self._T_cam0_camera[camera]
-        else:
-            key, place = factors.body_key(keyframe.index), self.T_body_cam @ self._T_cam0_camera[camera]
-        graph.push_back(
-            gtsam.GenericProjectionFactorCal3_S2(
-                point, self._pixel, key, factors.point_key(track_id), _CALIBRATION, gtsam.Pose3(place)
-            )
-        )
 
     def _hold(self, ids: Stamps, points: Array) -> None:
         ids = np.concatenate([self.point_ids, ids])
