@@ -216,7 +216,7 @@ class _Stopwatch:
         return told
 
 
-def play(recording: Recording, system: Sequence[str], init: str = "rest") -> Played:
+def play(recording: Recording, system: Sequence[str], init: str = "auto") -> Played:
     """Run a recording through the system that these overrides choose.
 
     Args:

@@ -291,7 +291,7 @@ def kitti(options: Options) -> list[Entry]:
     for sequence in ("06", "01"):
         source = ["dataset=kitti", f"dataset.root={options.folder()}", f"dataset.sequence='{sequence}'"]
         for fuser in options.fusers:
-            for init in ("groundtruth", "rest"):
+            for init in ("groundtruth", "auto"):
                 recording = open_recording(*source, "rig=mono")
                 played = play(recording, [f"fuser={fuser}", "rig=mono", *options.more], init)
                 attempts = [attempt.sentence for attempt in played.attempts if attempt.sentence]

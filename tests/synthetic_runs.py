@@ -134,7 +134,7 @@ def make_run(
         sample_frames=[_frame(random, int(truth.stamps_ns[k])) for k in range(100, frames, frames // 4)]
         if images
         else [],
-        init="rest",
+        init="auto",
         uses_ground_truth=(),
     )
 

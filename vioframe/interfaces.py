@@ -159,7 +159,7 @@ class Fuser(Component):
         Raises:
             ConfigError: this method initialises itself only.
         """
-        raise ConfigError(f"init=groundtruth: {type(self).__name__} cannot start from a given state; use init=rest")
+        raise ConfigError(f"init=groundtruth: {type(self).__name__} cannot start from a given state; use init=auto")
 
     def bias(self) -> ImuBias:
         """What the integrator should assume next."""

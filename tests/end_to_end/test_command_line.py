@@ -139,7 +139,7 @@ def test_a_failed_job_is_marked_and_the_others_finish(cli, tmp_path):
         (("fuser=ekf", "vo=twoview"), ("fuser=ekf needs metric_scale",)),
         (("tracker._target_=os.system",), ("tracker._target_=os.system is not allowed",)),
         (("dataset=euroc", "dataset.root=nowhere"), ("nowhere",)),
-        (("init=anywhere",), ("init=anywhere", "rest, groundtruth")),
+        (("init=anywhere",), ("init=anywhere", "auto, groundtruth")),
         (("dataset.duration_s=-3",), ("duration_s", "-3")),
         (("vo=stereo", "rig=mono"), ("vo=stereo needs the images of 2 cameras",)),
         (("tracker.uri=http://127.0.0.1:9",), ("127.0.0.1:9", "cannot be reached")),

@@ -97,7 +97,7 @@ def test_truth_that_covers_no_image_starts_nothing_and_says_so(cli):
     options = [f"dataset.root={shared_data('euroc_V1_01_micro')}", "dataset=euroc", "init=groundtruth"]
     done = cli("system=msckf", *options, *QUIET)
     assert done.returncode == 1
-    assert "init=groundtruth, but the ground truth has no pose at any image: use init=rest" in done.stderr
+    assert "init=groundtruth, but the ground truth has no pose at any image: use init=auto" in done.stderr
 
 
 def test_loop_map_of_another_rig_is_refused(cli, tmp_path):

@@ -53,7 +53,7 @@ class SequenceRun:
         track_counts: (K,) number of points followed.
         sample_frames: a few images for the report.
         attempts: to start, oldest first.
-        init: how the fuser was started, ``"rest"`` or ``"groundtruth"``.
+        init: how the fuser was started, ``"auto"``, by itself, or ``"groundtruth"``.
         uses_ground_truth: names of the parts that simulate a sensor from the truth.
         faults: what was spoilt on purpose in the recording.
         error: what went wrong, in one sentence, or None.
@@ -75,7 +75,7 @@ class SequenceRun:
     track_counts: Stamps = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     sample_frames: Sequence[SampleFrame] = ()
     attempts: Sequence[InitialisationAttempt] = ()
-    init: str = "rest"
+    init: str = "auto"
     uses_ground_truth: tuple[str, ...] = ()
     faults: tuple[str, ...] = ()
     error: str | None = None

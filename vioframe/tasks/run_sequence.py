@@ -22,7 +22,9 @@ from vioframe.viewer import Viewer
 
 log = logging.getLogger(__name__)
 
-INIT_CHOICES = ("rest", "groundtruth")
+INIT_CHOICES = ("auto", "groundtruth")
+# What ``auto`` was called while standing still was the only way to start.
+_FORMER_NAMES = {"rest": "auto"}
 # Ground truth comes at 100 Hz and more where it is good; longer holes (mocap drop-outs) start nothing.
 _MAX_TRUTH_GAP_NS = NANOSECONDS // 5
 
@@ -113,7 +115,7 @@ def run_sequence(
         pipeline: its parts are set up anew.
         recording: opened and checked.
         folder: where the states are kept while the run lasts.
-        init: ``rest`` or ``groundtruth``.
+        init: ``auto`` or ``groundtruth``.
         sample_count: frames to keep for the report.
         progress: called with the number of windows done.
         viewer: shows the run while it lasts.
@@ -165,7 +167,7 @@ def run_sequence(
         track_counts=np.array(recorder.track_counts, dtype=np.int64),
         sample_frames=recorder.samples,
         attempts=tuple(pipeline.fuser.attempts()),
-        init=init,
+        init=_FORMER_NAMES.get(init, init),
         uses_ground_truth=users,
         faults=recording.faults(),
         error=_say(stop, recorder.windows, expected) if stop or pipeline.windows else _nothing_ran(init),
@@ -193,22 +195,23 @@ def _say(stop: BaseException | None, done: int, expected: int) -> str | None:
 def _nothing_ran(init: str) -> str:
     """Why a recording that came to its end gave not one window."""
     if init == "groundtruth":
-        return "init=groundtruth, but the ground truth has no pose at any image: use init=rest"
+        return "init=groundtruth, but the ground truth has no pose at any image: use init=auto"
     return "no image could be paired with inertial samples, so nothing was estimated: check that both clocks overlap"
 
 
 def initial_state(init: str, truth: Trajectory | None, sequence: str) -> InitialState | None:
-    """The function that gives the pipeline its first state, or None where the fuser starts from rest.
+    """The function that gives the pipeline its first state, or None where the fuser starts by itself.
 
     Raises:
         ConfigError: an unknown ``init``, or no ground truth to start from.
     """
+    init = _FORMER_NAMES.get(init, init)
     if init not in INIT_CHOICES:
         raise ConfigError(f"init={init} is unknown: choose one of {', '.join(INIT_CHOICES)}")
-    if init == "rest":
+    if init == "auto":
         return None
     if truth is None:
-        raise ConfigError(f"init=groundtruth, but {sequence} has no ground truth: use init=rest")
+        raise ConfigError(f"init=groundtruth, but {sequence} has no ground truth: use init=auto")
     velocity = differentiate_positions(truth)
     known = truth
 

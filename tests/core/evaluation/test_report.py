@@ -81,7 +81,7 @@ def test_the_page_has_the_numbers_and_their_protocol(folder: Path) -> None:
     page = (folder / "report.html").read_text(encoding="utf-8")
     row = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))["sequences"][0]
     assert f"<td>{significant(row['ate_se3_m'])}</td>" in page
-    assert "init=rest" in page
+    assert "init=auto" in page
     assert "dropped frames: 3" in page
     assert "no segment of 100 m fits" in page
 

@@ -138,7 +138,7 @@ def test_a_whole_run_lacks_nothing() -> None:
         "output": "causal",
         "rate_hz": pytest.approx(20.0),
         "truth_rate_hz": pytest.approx(20.0),
-        "init": "rest",
+        "init": "auto",
         "uses_ground_truth": [],
         "faults": [],
         "nees_alignment": "yaw and position at the first tracking state",
