@@ -27,7 +27,8 @@ def points_around(truth: Trajectory, seed: int, count: int = 4000, far_m: float 
     """Points on the walls of a box around a trajectory, and some inside it near the walls, (count, 3)."""
     rng = np.random.default_rng(seed)
     p = truth.T_world_body[:, :3, 3]
-    low, high = p.min(axis=0) - [far_m, far_m, 2.0], p.max(axis=0) + [far_m, far_m, 2.0]
+    margin = np.array([far_m, far_m, 2.0])
+    low, high = p.min(axis=0) - margin, p.max(axis=0) + margin
     unit = rng.uniform(0.0, 1.0, (count, 3))
     side = np.arange(count)
     unit[side, rng.integers(0, 3, count)] = rng.choice([0.0, 1.0], count) + rng.uniform(-0.1, 0.1, count)

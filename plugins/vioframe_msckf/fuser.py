@@ -284,8 +284,7 @@ class MsckfFuser(TightFuser):
         if full and len(state.points) < options.landmarks:
             self._promote(rows[fits], chosen, weights[fits], flat_points[good][fits], R_all, anchors[good][fits])
         Lambda, eta = information(chosen)
-        columns = state.clone_errors
-        if not correct_by_information(state, columns, Lambda, eta):
+        if not correct_by_information(state, Lambda, eta):
             self._count("corrections without a finite answer")
             return 0, refused
         return int((weights[fits] > 0.0).sum()), refused

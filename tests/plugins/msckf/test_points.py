@@ -76,7 +76,7 @@ class Scene:
 
 def test_triangulation_finds_exact_points_and_minimises_the_reprojection_error_of_noisy_ones():
     exact = Scene(sigma=0.0)
-    found, depth = triangulate(*exact.flat(), exact.anchors)
+    found, _ = triangulate(*exact.flat(), exact.anchors)
     np.testing.assert_allclose(found, exact.f, atol=1e-6)
     assert in_front(*exact.flat()[:2], found, exact.flat()[3], 0.1, 60.0).all()
     assert not in_front(*exact.flat()[:2], found, exact.flat()[3], 0.1, 2.0).any()
@@ -195,7 +195,7 @@ def moved(state, error):
 
 def test_sightings_correct_as_the_dense_filter_does():
     scene = Scene()
-    state, _, tracks, _ = state_of(scene)
+    state, *_ = state_of(scene)
     R, p = scene.R[0, -1], scene.p[0, -1]
 
     def predict(s):
