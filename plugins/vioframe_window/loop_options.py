@@ -90,8 +90,8 @@ class Verification:
     samples: int = 100
     inlier_px: float = 3.0
     search_px: float = 12.0
-    min_matches: int = 25
-    max_tilt_deg: float = 4.0
+    min_matches: int = 30
+    max_tilt_deg: float = 1.5
     max_yaw_deg: float = 30.0
     max_distance_m: float = 20.0
     max_drift: float = 0.1

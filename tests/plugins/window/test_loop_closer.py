@@ -172,7 +172,7 @@ def test_forgetting_keeps_what_matters(lap: tuple[PointWorld, np.ndarray, np.nda
     loop.setup(RIG)
     matches = walk(loop, world, truth, odometry)
     assert len(matches) > 5
-    assert gap(loop.correct(trajectory(odometry)).T_world_body, truth) < 0.15 * gap(odometry, truth)
+    assert gap(loop.correct(trajectory(odometry)).T_world_body, truth) < 0.25 * gap(odometry, truth)
 
 
 def test_a_better_pose_of_a_match_is_taken(lap: tuple[PointWorld, np.ndarray, np.ndarray]) -> None:
