@@ -222,7 +222,7 @@ def play(recording: Recording, system: Sequence[str], init: str = "auto") -> Pla
     Args:
         recording: with as many cameras as the system's ``rig=`` says.
         system: overrides, such as ``["fuser=msckf", "rig=stereo"]``.
-        init: ``rest`` or ``groundtruth``.
+        init: ``auto`` or ``groundtruth``.
     """
     config = compose_config(*system)
     choices = {slot: value for slot, _, value in (one.partition("=") for one in system) if slot in SLOTS}
