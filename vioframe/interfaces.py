@@ -18,6 +18,7 @@ from vioframe.types import (
     ImuBlock,
     InertialDelta,
     InitialisationAttempt,
+    Measure,
     Measurement,
     NavState,
     Packet,
@@ -168,6 +169,10 @@ class Fuser(Component):
     def camera_delay_ns(self) -> int | None:
         """What the synchronizer should assume next, where this method estimates it (``t_imu = t_cam + delay``)."""
         return None
+
+    def calibration(self) -> Mapping[str, Measure]:
+        """What of the calibration is estimated, by name, as the change from the rig's; empty where nothing is."""
+        return {}
 
     def attempts(self) -> Sequence[InitialisationAttempt]:
         """Every attempt to start since ``setup``, oldest first, with what was missing."""

@@ -20,6 +20,7 @@ from vioframe.evaluation.wording import (
     Line,
     accuracy_lines,
     brief_accuracy_lines,
+    calibration_text,
     counter_text,
     failure_text,
     has_run,
@@ -208,6 +209,9 @@ def _sequence_section(row: Row, figures: Mapping[str, Path], *, anchor: str, hea
     started = start_text(row)
     if started:
         html.append(f"<p class=counters>{escape(started)}</p>")
+    calibrated = calibration_text(row)
+    if calibrated:
+        html.append(f"<p class=note>{escape(calibrated)}</p>")
     counted = counter_text(row)
     if counted:
         html.append(f"<p class=counters>{escape(counted)}</p>")

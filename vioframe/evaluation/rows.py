@@ -92,6 +92,7 @@ def evaluate_run(run: SequenceRun, options: EvaluationOptions | None = None) -> 
         "pipeline_s": run.pipeline_s,
         "wall_s": run.wall_s,
         "initialisation": attempt_entries(run.attempts, _origin_ns(run)),
+        "calibration": {name: {"value": found.value, "unit": found.unit} for name, found in run.calibration.items()},
         "counters": {name: int(count) for name, count in run.counters.items()},
         "undefined": cells.undefined,
         "protocol": make_protocol(run, options, "causal", states.stamps_ns).as_dict(),

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from vioframe.checks import Array, Stamps, check_array
-from vioframe.types import Image, InitialisationAttempt, NavState, Trajectory
+from vioframe.types import Image, InitialisationAttempt, Measure, NavState, Trajectory
 
 RunStatus = Literal["finished", "failed", "interrupted"]
 
@@ -53,6 +53,7 @@ class SequenceRun:
         track_counts: (K,) number of points followed.
         sample_frames: a few images for the report.
         attempts: to start, oldest first.
+        calibration: what of it the fuser estimated, by name, as the change from the rig's.
         init: how the fuser was started, ``"auto"``, by itself, or ``"groundtruth"``.
         uses_ground_truth: names of the parts that simulate a sensor from the truth.
         faults: what was spoilt on purpose in the recording.
@@ -75,6 +76,7 @@ class SequenceRun:
     track_counts: Stamps = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     sample_frames: Sequence[SampleFrame] = ()
     attempts: Sequence[InitialisationAttempt] = ()
+    calibration: Mapping[str, Measure] = field(default_factory=dict)
     init: str = "auto"
     uses_ground_truth: tuple[str, ...] = ()
     faults: tuple[str, ...] = ()

@@ -10,6 +10,7 @@ from vioframe.evaluation.wording import (
     UNDEFINED,
     accuracy_lines,
     brief_accuracy_lines,
+    calibration_text,
     counter_text,
     failure_text,
     has_run,
@@ -179,6 +180,9 @@ def _notes(row: Row, *, name: bool) -> "list[RenderableType]":
     started = start_text(row)
     if started:
         notes.append(Text(f"{prefix}{started}", style="yellow"))
+    calibrated = calibration_text(row)
+    if calibrated:
+        notes.append(Text(f"{prefix}{calibrated}", style="dim"))
     counted = counter_text(row)
     if counted:
         notes.append(Text(f"{prefix}{counted}", style="yellow"))

@@ -163,6 +163,15 @@ def counter_text(row: Mapping[str, object]) -> str:
     return ", ".join(f"{name}: {count}" for name, count in counters.items())
 
 
+def calibration_text(row: Mapping[str, object]) -> str:
+    """``calibration found, against the stated one: camera delay −1.7 ms, …``, or nothing."""
+    found = row.get("calibration")
+    if not isinstance(found, Mapping) or not found:
+        return ""
+    parts = [f"{name} {significant(float(change['value']))} {change['unit']}" for name, change in found.items()]
+    return f"calibration found, against the stated one: {', '.join(parts)}"
+
+
 def failure_text(row: Mapping[str, object]) -> str:
     """How a sequence ended that did not finish, and why."""
     status, error = str(row["status"]), str(row["error"])

@@ -167,6 +167,7 @@ def run_sequence(
         track_counts=np.array(recorder.track_counts, dtype=np.int64),
         sample_frames=recorder.samples,
         attempts=tuple(pipeline.fuser.attempts()),
+        calibration=pipeline.fuser.calibration(),
         init=_FORMER_NAMES.get(init, init),
         uses_ground_truth=users,
         faults=recording.faults(),

@@ -10,9 +10,11 @@ import numpy as np
 
 from vioframe.checks import Array
 from vioframe.consistency import StandstillTest
+from vioframe.conventions import seconds
 from vioframe.error_state import Body
 from vioframe.errors import ConfigError, ShapeError, StateError
 from vioframe.fusion_options import StandstillOptions
+from vioframe.geometry import se3, so3
 from vioframe.interfaces import INERTIAL_DELTA, STEREO_TRACKS, TRACKS, Fuser
 from vioframe.tight.failure import FailureMonitor
 from vioframe.tight.options import CalibrationOptions, FailureOptions, InertialTrust
@@ -22,6 +24,7 @@ from vioframe.tight.step import Start, Step, Support
 from vioframe.types import (
     ImuBias,
     InitialisationAttempt,
+    Measure,
     Measurement,
     NavState,
     SensorRig,
@@ -107,6 +110,21 @@ class TightFuser(Fuser):
     def T_body_cam(self) -> Array:
         """Place of camera 0 on the body, (4, 4), as estimated now; as calibrated where it is not."""
         return self._rig.cameras[0].T_body_cam
+
+    def calibration(self) -> Mapping[str, Measure]:
+        """Delay, rotation and position of camera 0 as estimated now, each as the change from the rig's."""
+        if not self._ready or not self._running:
+            return {}
+        found = {}
+        delay_ns = self.camera_delay_ns()
+        if delay_ns is not None:
+            change_ns = delay_ns - self._rig.camera_delay_ns
+            found["camera delay"] = Measure(value=1e3 * seconds(change_ns), unit="ms")
+        if self._calibration.estimates_extrinsics:
+            change = se3.inverse(self._rig.cameras[0].T_body_cam) @ self.T_body_cam()
+            found["camera turned by"] = Measure(value=float(np.degrees(so3.angle(change[:3, :3]))), unit="°")
+            found["camera moved by"] = Measure(value=1e3 * float(np.linalg.norm(change[:3, 3])), unit="mm")
+        return found
 
     def counters(self) -> Mapping[str, int]:
         """Restarts, windows with holes, missing windows, standstill measurements, and what the method counts."""

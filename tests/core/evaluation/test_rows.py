@@ -53,6 +53,7 @@ REST = [
     "pipeline_s",
     "wall_s",
     "initialisation",
+    "calibration",
     "counters",
     "undefined",
     "protocol",

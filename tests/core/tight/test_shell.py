@@ -135,6 +135,26 @@ def test_windows_seen_before_the_start_are_gone_through_again(walk):
     np.testing.assert_allclose(after.covariance, expected.covariance, atol=1e-15)
 
 
+def test_calibration_is_told_as_the_change_from_the_rigs(walk):
+    class Turned(Reckoner):
+        def camera_delay_ns(self):
+            return self._rig.camera_delay_ns - 1_500_000
+
+        def T_body_cam(self):
+            return super().T_body_cam() @ se3.exp(np.array([0.0, np.radians(2.0), 0.0, 0.003, 0.0, 0.004]))
+
+    fuser = Turned()
+    assert fuser.calibration() == {}
+    run(fuser, walk)
+    found = {name: (change.value, change.unit) for name, change in fuser.calibration().items()}
+    assert found["camera delay"] == (pytest.approx(-1.5), "ms")
+    assert found["camera turned by"] == (pytest.approx(2.0), "°")
+    assert found["camera moved by"] == (pytest.approx(5.0, rel=1e-3), "mm")
+    fixed = Reckoner(calibration=CalibrationOptions(extrinsics="fixed", time_offset=False))
+    run(fixed, walk)
+    assert fixed.calibration() == {}
+
+
 def test_status_follows_support(walk):
     fuser = Reckoner(failure=FailureOptions(lost_after_s=0.5, restart_after_s=100.0))
 
