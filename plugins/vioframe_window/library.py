@@ -1,4 +1,4 @@
-"""The door to gtsam, which is an extra: everything else in this plugin that needs it is imported behind it."""
+"""The door to gtsam: slow to import and not built for every machine, so all that needs it is imported behind it."""
 
 from importlib.util import find_spec
 
@@ -13,6 +13,6 @@ def require_gtsam() -> None:
     """
     if find_spec("gtsam") is None:
         raise PluginError(
-            "fuser=window solves its window with gtsam, which is not installed: pip install 'vioframe[window]', "
+            "fuser=window solves its window with gtsam, which is not installed: pip install 'gtsam>=4.3,<4.4', "
             "or choose fuser=msckf, which needs nothing more"
         )

@@ -183,7 +183,7 @@ def test_smoothed_keyframes_are_no_worse_and_not_causal():
 
 def test_without_gtsam_it_says_what_to_install(monkeypatch):
     monkeypatch.setattr(library, "find_spec", lambda name: None)
-    with pytest.raises(PluginError, match=r"pip install 'vioframe\[window\]'"):
+    with pytest.raises(PluginError, match=r"pip install 'gtsam"):
         WindowFuser()
 
 
