@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from vioframe.errors import ClockError, ShapeError
+from vioframe.errors import ClockError, ConfigError, ShapeError
 
 Array = npt.NDArray[np.floating]
 Stamps = npt.NDArray[np.int64]
@@ -81,3 +81,25 @@ def check_pose(field: str, T: object, *, tolerance: float = 1e-6) -> None:
         raise ShapeError(f"{field} must be a rotation, but its determinant is negative: a mirrored axis")
     if T.size and np.abs(T[..., 3, :] - (0.0, 0.0, 0.0, 1.0)).max() > tolerance:
         raise ShapeError(f"{field} must have the last row (0, 0, 0, 1)")
+
+
+def check_positive(group: str, **values: float) -> None:
+    """Refuse options that are not above zero.
+
+    Args:
+        group: their place in the config, such as ``"fuser.inertial"``.
+        values: by name.
+
+    Raises:
+        ConfigError: with the key and its value.
+    """
+    for name, value in values.items():
+        if not value > 0.0:
+            raise ConfigError(f"{group}.{name} must be positive, got {value}")
+
+
+def check_not_negative(group: str, **values: float) -> None:
+    """Refuse options below zero; arguments and error as of :func:`check_positive`."""
+    for name, value in values.items():
+        if not value >= 0.0:
+            raise ConfigError(f"{group}.{name} must not be negative, got {value}")

@@ -7,23 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vioframe.checks import Array
+from vioframe.checks import Array, check_not_negative, check_positive
 from vioframe.consistency import NoiseAdaptation, StandstillTest, chi_square_limit
 from vioframe.errors import ConfigError
 from vioframe.initialisation import RestInitialiser, StillnessDetector, initial_covariance
 from vioframe.types import InertialDelta, NavState, RelativePose, SensorRig
-
-
-def _check_positive(group: str, **values: float) -> None:
-    for name, value in values.items():
-        if not value > 0.0:
-            raise ConfigError(f"fuser.{group}.{name} must be positive, got {value}")
-
-
-def _check_not_negative(group: str, **values: float) -> None:
-    for name, value in values.items():
-        if not value >= 0.0:
-            raise ConfigError(f"fuser.{group}.{name} must not be negative, got {value}")
 
 
 def _check_gate(group: str, probability: float) -> None:
@@ -60,8 +48,8 @@ class InertialOptions:
     gap_accel_sigma: float = 2.0
 
     def __post_init__(self) -> None:
-        _check_positive(
-            "inertial",
+        check_positive(
+            "fuser.inertial",
             gyro_noise_scale=self.gyro_noise_scale,
             accel_noise_scale=self.accel_noise_scale,
             adapt_s=self.adapt_s,
@@ -69,8 +57,8 @@ class InertialOptions:
         )
         if not self.adapt_most >= 1.0:
             raise ConfigError(f"fuser.inertial.adapt_most must be at least 1, got {self.adapt_most}; 1 adapts nothing")
-        _check_not_negative(
-            "inertial",
+        check_not_negative(
+            "fuser.inertial",
             walk_scale=self.walk_scale,
             gap_rate_sigma=self.gap_rate_sigma,
             gap_accel_sigma=self.gap_accel_sigma,
@@ -114,15 +102,15 @@ class VisualOptions:
     recover_velocity_sigma: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_positive(
-            "visual",
+        check_positive(
+            "fuser.visual",
             covariance_scale=self.covariance_scale,
             rotation_sigma=self.rotation_sigma,
             lost_after_s=self.lost_after_s,
             recover_after_s=self.recover_after_s,
         )
-        _check_not_negative(
-            "visual",
+        check_not_negative(
+            "fuser.visual",
             translation_sigma=self.translation_sigma,
             translation_ratio=self.translation_ratio,
             recover_tilt_sigma=self.recover_tilt_sigma,
@@ -176,13 +164,13 @@ class StandstillOptions:
     gate_probability: float = 0.9
 
     def __post_init__(self) -> None:
-        _check_positive(
-            "standstill",
+        check_positive(
+            "fuser.standstill",
             rotation_sigma=self.rotation_sigma,
             position_sigma=self.position_sigma,
             velocity_sigma=self.velocity_sigma,
         )
-        _check_not_negative("standstill", speed=self.speed)
+        check_not_negative("fuser.standstill", speed=self.speed)
         _check_gate("standstill", self.gate_probability)
 
     def gate(self) -> float:
@@ -228,8 +216,8 @@ class StartOptions:
     accel_bias_sigma: float = 0.1
 
     def __post_init__(self) -> None:
-        _check_positive(
-            "start",
+        check_positive(
+            "fuser.start",
             tilt_sigma=self.tilt_sigma,
             yaw_sigma=self.yaw_sigma,
             position_sigma=self.position_sigma,

@@ -146,6 +146,7 @@ def read_mat(path: Path) -> Mapping[str, Array]:
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
 
+    # What scipy raises depends on where a file is damaged; NotImplementedError is its word for MATLAB 7.3 (HDF5).
     try:
         content: Mapping[str, Array] = loadmat(path)
     except (MatReadError, ValueError, NotImplementedError, OSError, TypeError, EOFError) as error:

@@ -2,13 +2,8 @@
 
 from dataclasses import dataclass
 
+from vioframe.checks import check_positive
 from vioframe.errors import ConfigError
-
-
-def _check_positive(group: str, **values: float) -> None:
-    for name, value in values.items():
-        if not value > 0.0:
-            raise ConfigError(f"loop.{group}.{name} must be positive, got {value}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,8 +37,8 @@ class Retrieval:
     most: int = 2000
 
     def __post_init__(self) -> None:
-        _check_positive(
-            "retrieval",
+        check_positive(
+            "loop.retrieval",
             spacing_m=self.spacing_m,
             spacing_deg=self.spacing_deg,
             threshold=self.threshold,
@@ -98,8 +93,8 @@ class Verification:
     max_drift_m: float = 2.0
 
     def __post_init__(self) -> None:
-        _check_positive(
-            "verification",
+        check_positive(
+            "loop.verification",
             sure_distance=self.sure_distance,
             max_distance=self.max_distance,
             samples=self.samples,
@@ -147,8 +142,8 @@ class GraphOptions:
     solve_above: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_positive(
-            "graph",
+        check_positive(
+            "loop.graph",
             solve_above=self.solve_above,
             neighbours=self.neighbours,
             step_sigma_m=self.step_sigma_m,

@@ -2,13 +2,8 @@
 
 from dataclasses import dataclass
 
+from vioframe.checks import check_positive
 from vioframe.errors import ConfigError
-
-
-def _check_positive(group: str, **values: float) -> None:
-    for name, value in values.items():
-        if not value > 0.0:
-            raise ConfigError(f"fuser.{group}.{name} must be positive, got {value}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,8 +29,8 @@ class WindowOptions:
     covariance_every: int = 3
 
     def __post_init__(self) -> None:
-        _check_positive(
-            "window", lag_s=self.lag_s, keyframe_s=self.keyframe_s, relinearise_above=self.relinearise_above
+        check_positive(
+            "fuser.window", lag_s=self.lag_s, keyframe_s=self.keyframe_s, relinearise_above=self.relinearise_above
         )
         if self.lag_s < 2.0 * self.keyframe_s:
             raise ConfigError(
@@ -75,8 +70,8 @@ class LandmarkOptions:
     huber: float = 2.0
 
     def __post_init__(self) -> None:
-        _check_positive(
-            "landmarks",
+        check_positive(
+            "fuser.landmarks",
             most=self.most,
             most_new=self.most_new,
             min_parallax_deg=self.min_parallax_deg,

@@ -5,24 +5,13 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from vioframe.checks import check_not_negative, check_positive
 from vioframe.conventions import NANOSECONDS, seconds
 from vioframe.errors import ConfigError
 from vioframe.increments import add_gap
 from vioframe.types import ImuNoise, InertialDelta
 
 Extrinsics = Literal["fixed", "refine", "find"]
-
-
-def _check_positive(group: str, **values: float) -> None:
-    for name, value in values.items():
-        if not value > 0.0:
-            raise ConfigError(f"fuser.{group}.{name} must be positive, got {value}")
-
-
-def _check_not_negative(group: str, **values: float) -> None:
-    for name, value in values.items():
-        if not value >= 0.0:
-            raise ConfigError(f"fuser.{group}.{name} must not be negative, got {value}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,14 +38,14 @@ class InertialTrust:
     gap_accel_sigma: float = 2.0
 
     def __post_init__(self) -> None:
-        _check_positive(
-            "inertial",
+        check_positive(
+            "fuser.inertial",
             gyro_noise_scale=self.gyro_noise_scale,
             accel_noise_scale=self.accel_noise_scale,
             gap_allowed_s=self.gap_allowed_s,
         )
-        _check_not_negative(
-            "inertial",
+        check_not_negative(
+            "fuser.inertial",
             gyro_walk_scale=self.gyro_walk_scale,
             accel_walk_scale=self.accel_walk_scale,
             gap_rate_sigma=self.gap_rate_sigma,
@@ -111,8 +100,8 @@ class CalibrationOptions:
                 f"fuser.calibration.extrinsics must be one of {', '.join(get_args(Extrinsics))}, "
                 f"got {self.extrinsics!r}"
             )
-        _check_positive(
-            "calibration",
+        check_positive(
+            "fuser.calibration",
             rotation_sigma=self.rotation_sigma,
             position_sigma=self.position_sigma,
             time_offset_sigma_s=self.time_offset_sigma_s,
@@ -151,8 +140,8 @@ class FailureOptions:
     def __post_init__(self) -> None:
         if self.min_used < 1:
             raise ConfigError(f"fuser.failure.min_used must be at least 1, got {self.min_used}")
-        _check_positive(
-            "failure",
+        check_positive(
+            "fuser.failure",
             lost_after_s=self.lost_after_s,
             restart_after_s=self.restart_after_s,
             max_gyro_bias=self.max_gyro_bias,
