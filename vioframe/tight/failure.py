@@ -12,6 +12,8 @@ from vioframe.types import ImuNoise, NavState
 
 # Fewer points than this in an image are a blind camera, which no restart mends.
 _SEES = 15
+# m/s², what a body may gain or lose of its speed within a window before a change of place counts as a jump.
+_ACCELERATES = 20.0
 
 
 class FailureMonitor:
@@ -84,7 +86,7 @@ class FailureMonitor:
 
     def _broken(self, step: Step, before: NavState, after: NavState) -> str | None:
         options = self._options
-        # What the inertial samples alone would have given tells how far the images moved the position.
+        # Constant velocity is what the position is held against: the jump of a wrong correction is far beyond it.
         T = step.delta.duration_s
         moved = np.linalg.norm(after.T_world_body[:3, 3] - before.T_world_body[:3, 3] - before.v_world_body * T)
         variances = np.zeros(1) if after.covariance is None else np.diag(after.covariance)
@@ -93,7 +95,7 @@ class FailureMonitor:
             ("gyro bias", np.linalg.norm(after.bias.gyro) > options.max_gyro_bias),
             ("accelerometer bias", np.linalg.norm(after.bias.accel) > options.max_accel_bias),
             ("speed", np.linalg.norm(after.v_world_body) > options.max_speed),
-            ("jump", moved > options.max_correction_m + 0.5 * 20.0 * T * T),
+            ("jump", moved > options.max_correction_m + 0.5 * _ACCELERATES * T * T),
         )
         return next((name for name, bad in checks if bad), None)
 

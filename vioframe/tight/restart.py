@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from vioframe.checks import Array
+from vioframe.conventions import seconds
 from vioframe.error_state import Body, InertialFilter
 from vioframe.geometry import so3
 from vioframe.increments import coasting
@@ -92,7 +93,7 @@ def coast_across(state: NavState, window: SyncedWindow, gravity: float, trust: I
     body = Body.of(state)
     down = np.array([0.0, 0.0, -gravity])
     duration_ns = window.previous.stamp_ns - state.stamp_ns
-    delta = coasting(body, duration_ns * 1e-9, down, trust.gap_rate_sigma, trust.gap_accel_sigma)
+    delta = coasting(body, seconds(duration_ns), down, trust.gap_rate_sigma, trust.gap_accel_sigma)
     lift = body.bias.accel - body.R.T @ down
     made_up = SyncedWindow(
         previous=replace(window.previous, stamp_ns=state.stamp_ns, images=()),
