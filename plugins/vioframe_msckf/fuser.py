@@ -109,22 +109,19 @@ class MsckfFuser(TightFuser):
         self._state.delay_s = self._told_delay_s if start.camera_delay_s is None else start.camera_delay_s
         self._table = TrackTable(len(self._noise_of), self._points.clones + 1)
         self._misses: dict[int, int] = {}
-        self._newest: NavState | None = None
-        self._newest_ns = start.state.stamp_ns
+        self._now_ns = start.state.stamp_ns
 
     @property
     def _told_delay_ns(self) -> int:
         return round(self._told_delay_s * NANOSECONDS)
 
     def _estimate(self) -> NavState:
-        if self._newest is None:
-            self._newest = self._state.nav_state(self._newest_ns)
-        return self._newest
+        return self._state.nav_state(self._now_ns)
 
     def _advance(self, step: Step) -> Support:
         state = self._state
         state.propagate(step.delta)
-        self._newest, self._newest_ns = None, step.stamp_ns
+        self._now_ns = step.stamp_ns
         used = refused = 0
         at_rest = False
         self._table.begin_image()

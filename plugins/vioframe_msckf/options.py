@@ -32,7 +32,7 @@ class PointOptions:
     landmarks: int = 30
     tracks_per_frame: int = 60
     min_observations: int = 4
-    track_gate: float = 6.0
+    track_gate: float = 4.0
     landmark_gate: float = 1.0
     landmark_parallax_deg: float = 1.0
     min_depth_m: float = 0.1

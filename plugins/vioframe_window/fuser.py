@@ -183,7 +183,7 @@ class WindowFuser(TightFuser):
         self._continue()
 
     def _advance(self, step: Step) -> Support:
-        self._samples.push(step.window)
+        self._samples.push(step.window, step.noise)
         self._filter.propagate(step.delta)
         self._now_ns = step.stamp_ns
         self._rested = self._rested and step.at_rest

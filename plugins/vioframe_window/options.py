@@ -21,7 +21,7 @@ class WindowOptions:
             the inertial samples.
     """
 
-    lag_s: float = 3.0
+    lag_s: float = 2.0
     keyframe_s: float = 0.2
     sparse_below: float = 0.5
     iterations: int = 1
@@ -66,8 +66,8 @@ class LandmarkOptions:
     max_error_px: float = 3.0
     min_depth: float = 0.2
     max_depth: float = 60.0
-    sigma_px: float = 0.5
-    huber: float = 2.0
+    sigma_px: float = 0.6
+    huber: float = 1.8
 
     def __post_init__(self) -> None:
         check_positive(

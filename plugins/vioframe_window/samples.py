@@ -42,13 +42,12 @@ class SampleIntegrator:
     """Collects the samples since the last keyframe.
 
     Args:
-        noise: densities to work with.
+        noise: densities, of which the white ones hold until :meth:`push` says otherwise.
         gravity: m/s².
         trust: how far holes between samples are believed.
     """
 
     def __init__(self, noise: ImuNoise, gravity: float, trust: InertialTrust) -> None:
-        self._noise = noise
         self._trust = trust
         self._params = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
         self._params.setIntegrationCovariance(_INTEGRATION_SIGMA**2 * np.eye(3))
@@ -64,14 +63,15 @@ class SampleIntegrator:
             self._params, gtsam.imuBias.ConstantBias(bias.accel, bias.gyro)
         )
 
-    def push(self, window: SyncedWindow) -> None:
-        """Take the samples of one more window."""
+    def push(self, window: SyncedWindow, noise: ImuNoise) -> None:
+        """Take the samples of one more window, which are believed with these white densities."""
         rates, forces, steps = midpoint_steps(window, self._bias)
         collected = self._collected
+        self._set_white_noise(noise.gyro_noise, noise.accel_noise)
         in_hole = np.zeros(len(steps), dtype=bool)
         gap_s = seconds(window.gap_ns)
         if self._trust.has_gap(window.gap_ns):
-            in_hole = steps > _HOLE_STEPS / self._noise.rate_hz
+            in_hole = steps > _HOLE_STEPS / noise.rate_hz
         for rate, force, step, hole in zip(rates, forces, steps.tolist(), in_hole.tolist(), strict=True):
             if hole:
                 # An unknown constant over the hole: as white noise, as strong as what it adds up to at its end.
@@ -79,7 +79,7 @@ class SampleIntegrator:
                 self._set_white_noise(self._trust.gap_rate_sigma * root, self._trust.gap_accel_sigma * root)
             collected.integrateMeasurement(force, rate, step)
             if hole:
-                self._set_white_noise(self._noise.gyro_noise, self._noise.accel_noise)
+                self._set_white_noise(noise.gyro_noise, noise.accel_noise)
 
     def take(self) -> gtsam.PreintegratedCombinedMeasurements:
         """The increment since :meth:`begin`."""

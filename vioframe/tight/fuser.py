@@ -19,6 +19,7 @@ from vioframe.interfaces import INERTIAL_DELTA, STEREO_TRACKS, TRACKS, Fuser
 from vioframe.tight.failure import FailureMonitor
 from vioframe.tight.options import CalibrationOptions, FailureOptions, InertialTrust
 from vioframe.tight.restart import DeadReckoning, coast_across
+from vioframe.tight.scatter import SampleScatter
 from vioframe.tight.start import Starter, TightStartOptions
 from vioframe.tight.step import Start, Step, Support
 from vioframe.types import (
@@ -86,7 +87,8 @@ class TightFuser(Fuser):
                 "none: choose fuser=imu_only, or a recording with a camera"
             )
         self._rig = rig
-        self._noise = self._inertial.noise(rig.imu)
+        self._noise = self._inertial.noise(rig.imu, self._inertial.scales(None))
+        self._scatter = SampleScatter(rig.imu)
         self._counts: dict[str, int] = {}
         self._attempts: list[InitialisationAttempt] = []
         self._stamp_ns: int | None = None
@@ -104,7 +106,7 @@ class TightFuser(Fuser):
         if not self._ready:
             return ImuBias()
         if self._running:
-            return self._estimate().bias
+            return self._newest.bias
         return ImuBias() if self._past is None else self._past.bias
 
     def T_body_cam(self) -> Array:
@@ -141,6 +143,7 @@ class TightFuser(Fuser):
         window = measurement.window
         if self._stamp_ns is not None and self._stamp_ns != window.previous.stamp_ns:
             self._cross_hole(window)
+        self._scatter.push(window)
         states: list[NavState] = []
         if self._running:
             self._move_on(measurement)
@@ -150,7 +153,7 @@ class TightFuser(Fuser):
             states = self._try_to_start(measurement)
         self._stamp_ns = window.current.stamp_ns
         if self._running:
-            states.append(replace(self._estimate(), stamp_ns=self._stamp_ns, status=self._status()))
+            states.append(replace(self._newest, stamp_ns=self._stamp_ns, status=self._status()))
         elif self._past is not None:
             states.append(self._past.state(self._stamp_ns))
         return states
@@ -172,12 +175,13 @@ class TightFuser(Fuser):
             state = self._past.brought_into_frame(state)
             self._count("restarts")
         self._begin(replace(start, state=state))
+        self._newest = self._estimate()
         self._running = True
         self._past = None
         self._monitor.begin(state)
         before = []
         if state.stamp_ns == measurement.window.previous.stamp_ns and self._stamp_ns is None:
-            before = [replace(self._estimate(), stamp_ns=state.stamp_ns, status="tracking")]
+            before = [replace(self._newest, stamp_ns=state.stamp_ns, status="tracking")]
         for past in start.replay:
             if self._running:
                 self._move_on(past)
@@ -185,10 +189,11 @@ class TightFuser(Fuser):
 
     def _move_on(self, measurement: Measurement) -> None:
         step = self._prepare(measurement)
-        before = self._estimate()
+        before = self._newest
         try:
             support = self._advance(step)
-            reason = self._monitor.judge(step, before, self._estimate(), support)
+            self._newest = self._estimate()
+            reason = self._monitor.judge(step, before, self._newest, support)
         except (ShapeError, np.linalg.LinAlgError):
             # A NavState refuses what is not finite, and a covariance that is none has no factor.
             reason = self._monitor.note_collapse(step)
@@ -213,7 +218,7 @@ class TightFuser(Fuser):
         self._new_start()
 
     def _prepare(self, measurement: Measurement) -> Step:
-        body = Body.of(self._estimate())
+        body = Body.of(self._newest)
         at_rest = self._standstill_test.push(measurement.window, body) and self._standstill.enabled
         if self._inertial.has_gap(measurement.window.gap_ns):
             self._count("inertial gaps")
@@ -226,9 +231,11 @@ class TightFuser(Fuser):
         bias = self.bias()
         if not (np.array_equal(delta.bias.gyro, bias.gyro) and np.array_equal(delta.bias.accel, bias.accel)):
             delta = delta.at(bias)
+        scales = self._inertial.scales(self._scatter.ratios)
         return Step(
             window=measurement.window,
-            delta=self._inertial.trusted(delta, measurement.window.gap_ns),
+            delta=self._inertial.trusted(delta, measurement.window.gap_ns, scales),
+            noise=self._inertial.noise(self._rig.imu, scales),
             tracks=Tracks.none() if features is None or features.tracks is None else features.tracks,
             stereo=features.stereo if features is not None and self._uses_stereo else None,
             at_rest=at_rest,
@@ -243,7 +250,7 @@ class TightFuser(Fuser):
             self._starter.interrupt()
             if self._past is None:
                 return
-        state = self._past.state(self._stamp_ns) if self._past is not None else self._estimate()
+        state = self._past.state(self._stamp_ns) if self._past is not None else self._newest
         hole = coast_across(state, window, self._rig.gravity, self._inertial)
         if self._past is not None:
             self._past.move_on(self._step(hole, at_rest=False))

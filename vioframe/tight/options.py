@@ -22,6 +22,7 @@ class InertialTrust:
         gyro_noise_scale: factor on the gyro's white noise density of the rig. A data sheet states that of a
             sensor that does not shake.
         accel_noise_scale: factor on the accelerometer's.
+        follow_scatter: use these factors only as far as successive samples scatter more than the rig states.
         gyro_walk_scale: factor on the gyro bias walk density.
         accel_walk_scale: factor on the accelerometer bias walk density.
         gap_allowed_s: a longer hole between samples widens the covariance.
@@ -31,6 +32,7 @@ class InertialTrust:
 
     gyro_noise_scale: float = 1.0
     accel_noise_scale: float = 1.0
+    follow_scatter: bool = True
     gyro_walk_scale: float = 1.0
     accel_walk_scale: float = 1.0
     gap_allowed_s: float = 0.05
@@ -52,12 +54,24 @@ class InertialTrust:
             gap_accel_sigma=self.gap_accel_sigma,
         )
 
-    def noise(self, stated: ImuNoise) -> ImuNoise:
-        """The densities to work with."""
+    def scales(self, scatter: tuple[float, float] | None) -> tuple[float, float]:
+        """Factors on the white noise densities of gyro and accelerometer.
+
+        Args:
+            scatter: of their samples, over the stated (:class:`~vioframe.tight.scatter.SampleScatter`); None where
+                it is not known: the sensor may shake.
+        """
+        most = self.gyro_noise_scale, self.accel_noise_scale
+        if scatter is None or not self.follow_scatter:
+            return most
+        return min(most[0], max(scatter[0], 1.0)), min(most[1], max(scatter[1], 1.0))
+
+    def noise(self, stated: ImuNoise, scales: tuple[float, float]) -> ImuNoise:
+        """The densities to work with, of those of the rig."""
         return replace(
             stated,
-            gyro_noise=stated.gyro_noise * self.gyro_noise_scale,
-            accel_noise=stated.accel_noise * self.accel_noise_scale,
+            gyro_noise=stated.gyro_noise * scales[0],
+            accel_noise=stated.accel_noise * scales[1],
             gyro_walk=stated.gyro_walk * self.gyro_walk_scale,
             accel_walk=stated.accel_walk * self.accel_walk_scale,
         )
@@ -66,9 +80,10 @@ class InertialTrust:
         """Whether a hole of this length widens the covariance."""
         return gap_ns > round(self.gap_allowed_s * NANOSECONDS)
 
-    def trusted(self, delta: InertialDelta, gap_ns: int) -> InertialDelta:
+    def trusted(self, delta: InertialDelta, gap_ns: int, scales: tuple[float, float]) -> InertialDelta:
         """The increment with the scaled covariance, widened for a hole; that of v and p is the accelerometer's."""
-        factor = np.repeat([self.gyro_noise_scale, self.accel_noise_scale, self.accel_noise_scale], 3)
+        gyro, accel = scales
+        factor = np.repeat([gyro, accel, accel], 3)
         delta = replace(delta, covariance=factor[:, None] * delta.covariance * factor)
         if self.has_gap(gap_ns):
             return add_gap(delta, seconds(gap_ns), self.gap_rate_sigma, self.gap_accel_sigma)

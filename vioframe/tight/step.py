@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from vioframe.checks import Array
-from vioframe.types import InertialDelta, Measurement, NavState, SyncedWindow, Tracks
+from vioframe.types import ImuNoise, InertialDelta, Measurement, NavState, SyncedWindow, Tracks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -36,7 +36,8 @@ class Step:
 
     Attributes:
         window: inertial samples and stamps; ``window.camera_delay_ns`` is the delay that its stamps contain.
-        delta: increment over the window, at the estimator's bias, with the stated trust in it, holes included.
+        delta: increment over the window, at the estimator's bias, with the trust in it, holes included.
+        noise: densities that the samples of the window are believed with, holes apart.
         tracks: points in camera 0 at ``window.current``; empty where no image came.
         stereo: the same points in camera 1, as far as found, or None.
         at_rest: the body seems to stand still.
@@ -44,6 +45,7 @@ class Step:
 
     window: SyncedWindow
     delta: InertialDelta
+    noise: ImuNoise
     tracks: Tracks
     stereo: Tracks | None
     at_rest: bool

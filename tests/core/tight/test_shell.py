@@ -299,6 +299,7 @@ def test_coasting_keeps_velocity_and_attitude():
         Step(
             window=made_up.window,
             delta=made_up.inertial_delta,
+            noise=make_rig().imu,
             tracks=Tracks.none(),
             stereo=None,
             at_rest=False,

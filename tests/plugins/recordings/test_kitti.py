@@ -188,6 +188,19 @@ def test_spline_velocity_beats_differences() -> None:
     assert (smooth - true).std() < 0.6 * (plain - true).std()
 
 
+def test_spline_velocity_holds_at_the_ends_of_a_curve() -> None:
+    rng = np.random.default_rng(3)
+    seconds = 0.1 * np.arange(60)
+    # 10 m/s in a curve of 23 m radius, as at the start of sequence 01.
+    angle = 10.0 / 23.0 * seconds
+    position = 23.0 * np.stack([np.sin(angle), 1.0 - np.cos(angle), 0.0 * angle], axis=1)
+    true = 10.0 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    stamps_ns = np.round(seconds * 1e9).astype(np.int64)
+    assert np.abs(spline_velocities(stamps_ns, position) - true).max() < 0.06
+    noisy = position + 0.005 * rng.normal(size=position.shape)
+    assert np.abs(spline_velocities(stamps_ns, noisy) - true).max() < 0.2
+
+
 def test_extrinsics_are_rotations_looking_ahead() -> None:
     for drive in DRIVE_DATES:
         R = drive.T_body_cam0[:3, :3]

@@ -75,7 +75,7 @@ def test_start_prior_is_the_information_of_its_covariance():
 def collected(imu, bias):
     integrator = SampleIntegrator(NOISE, GRAVITY, InertialTrust())
     integrator.begin(bias)
-    integrator.push(window_of(imu))
+    integrator.push(window_of(imu), NOISE)
     return integrator.take()
 
 
@@ -110,10 +110,10 @@ def test_a_hole_between_samples_widens_the_increment():
     trust = InertialTrust()
     integrator = SampleIntegrator(NOISE, GRAVITY, trust)
     integrator.begin(ImuBias())
-    integrator.push(window_of(imu, gap_ns=200_000_000))
+    integrator.push(window_of(imu, gap_ns=200_000_000), NOISE)
     sigmas = np.sqrt(np.diag(integrator.take().preintMeasCov()))
     np.testing.assert_allclose(sigmas[:3], trust.gap_rate_sigma * 0.2, rtol=0.1)
     assert (sigmas[6:9] > 0.7 * trust.gap_accel_sigma * 0.2).all()
     integrator.begin(ImuBias())
-    integrator.push(window_of(samples(even_stamps(0.4, 0.5, 20))))
+    integrator.push(window_of(samples(even_stamps(0.4, 0.5, 20))), NOISE)
     assert np.sqrt(np.diag(integrator.take().preintMeasCov()))[:3].max() < 1e-3
