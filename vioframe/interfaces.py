@@ -8,7 +8,7 @@ require it with no change here.
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 from vioframe.checks import Array
 from vioframe.errors import ConfigError, PluginError
@@ -28,6 +28,11 @@ from vioframe.types import (
     Trajectory,
     VisualFeatures,
 )
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+    from vioframe.learning.batch import WindowBatch
 
 TRACKS, FLOW, EMBEDDING = "tracks", "flow", "embedding"
 """Fields of :class:`VisualFeatures`."""
@@ -193,4 +198,54 @@ class UsesGroundTruth(Protocol):
 
     def take_ground_truth(self, trajectory: Trajectory) -> None:
         """Receive the true trajectory, after ``setup`` and before the first packet."""
+        ...
+
+
+@runtime_checkable
+class Trainable(Protocol):
+    """A component that *has* a net and can be trained; see ``vioframe/learning``.
+
+    In training the parts run on batches, in the order of the pipeline; what one returns is added, by name, to what
+    the later ones find ``upstream``. A part that answers with a motion of the camera returns it as
+    ``"T_prev_cur"``: (B, S - context_pairs + 1, 4, 4) in metres, for the last pairs of each window.
+
+    Attributes:
+        net: all that is learned, the weights of a loss with several terms included, so that they are saved too.
+        context_pairs: how many pairs of images in a row one answer takes, 1 or more.
+        architecture: plain values on which a file of weights must agree with this part, such as
+            ``{"part": "tsvo", "backbone": "resnet50", "stack": 10}``.
+    """
+
+    net: "nn.Module"
+
+    @property
+    def context_pairs(self) -> int:
+        """See the class."""
+        ...
+
+    @property
+    def architecture(self) -> Mapping[str, str | int | float | bool]:
+        """See the class."""
+        ...
+
+    def forward_batch(self, batch: "WindowBatch", upstream: Mapping[str, "Tensor"]) -> dict[str, "Tensor"]:
+        """Run the net on a batch.
+
+        Args:
+            batch: on the net's device, images in [0, 1].
+            upstream: what the parts before returned, by name.
+        """
+        ...
+
+    def loss(self, outputs: Mapping[str, "Tensor"], batch: "WindowBatch") -> dict[str, "Tensor"]:
+        """Compare what the net returned with the truth.
+
+        Args:
+            outputs: what :meth:`forward_batch` returned.
+            batch: the same batch.
+
+        Returns:
+            scalars by name: ``"loss"`` is minimised, the others are only recorded. Empty for a part that is trained
+            through the parts after it.
+        """
         ...

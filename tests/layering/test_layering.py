@@ -2,6 +2,8 @@
 
 import ast
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -63,11 +65,23 @@ def test_every_package_is_shipped():
 def test_heavy_libraries_are_imported_where_they_are_needed(folder: str):
     """At module level they would cost every ``--help`` a second or more."""
     heavy = {"mlflow", "matplotlib", "scipy", "rich", "torch", "lightning", "pandas", "rosbags", "rerun"}
+    learned = {"torch", "lightning", "safetensors"}
     for path in (ROOT / folder).rglob("*.py"):
+        # What works on tensors is imported when a net is; test_packages_import_no_torch holds that.
+        tensors = path.name != "__init__.py" and (folder == "plugins" or path.parent.name == "learning")
+        forbidden = heavy - learned if tensors else heavy | learned
         for node in ast.parse(path.read_text()).body:
             names = []
             if isinstance(node, ast.Import):
                 names = [alias.name for alias in node.names]
             elif isinstance(node, ast.ImportFrom):
                 names = [node.module or ""]
-            assert not [name for name in names if name.partition(".")[0] in heavy], f"{path}:{node.lineno}"
+            assert not [name for name in names if name.partition(".")[0] in forbidden], f"{path}:{node.lineno}"
+
+
+@pytest.mark.parametrize("package", [*(plugin.name for plugin in PLUGINS), "vioframe.interfaces", "vioframe.learning"])
+def test_packages_import_no_torch(package: str):
+    """A component's module may be imported by ``task=plugins`` and by a pipeline that never runs a net."""
+    check = f"import sys, {package}; sys.exit(bool({{'torch', 'lightning', 'safetensors'}} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr or f"{package} imports torch"

@@ -1,0 +1,216 @@
+"""From a recording to windows of consecutive images for training: numpy only, and no truth for any estimator.
+
+A :class:`StoredSequence` holds one recording as training needs it: decoded images of camera 0 at the size of the net,
+the inertial samples between them, and the true motion of the camera. :class:`WindowIndex` says where windows may
+begin: nowhere across a missing image or where the truth is unknown. Splits are made of whole recordings.
+"""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from vioframe.checks import Array, Mask, Stamps, check_array, check_increasing, check_pose
+from vioframe.conventions import NANOSECONDS
+from vioframe.errors import ConfigError, DataError, ShapeError
+from vioframe.geometry import se3
+from vioframe.types import Camera, Image, ImuBlock
+
+# A pair further apart than this many usual intervals is not two consecutive images: some are missing between them.
+_LONGEST_STEP = 1.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StoredSequence:
+    """One recording, decoded and resized.
+
+    Attributes:
+        name: of the sequence.
+        images: (F, H, W, C) uint8, C = 1 or 3 (RGB), of camera 0; may be mapped from disk.
+        stamps_ns: (F,) IMU clock.
+        T_world_cam: (F, 4, 4) true poses of camera 0; the identity where unknown.
+        known: (F,) whether the pose is known.
+        imu: samples around and between the images, or None.
+        camera: camera 0 as it is after resizing.
+        gravity: m/s².
+    """
+
+    name: str
+    images: Image
+    stamps_ns: Stamps
+    T_world_cam: Array
+    known: Mask
+    imu: ImuBlock | None
+    camera: Camera
+    gravity: float
+
+    def __post_init__(self) -> None:
+        count = len(self.stamps_ns)
+        if self.images.ndim != 4 or len(self.images) != count or self.images.shape[-1] not in (1, 3):
+            raise ShapeError(f"StoredSequence.images must have shape ({count}, H, W, 1 or 3), got {self.images.shape}")
+        check_array("StoredSequence.known", self.known, (count,), np.bool_)
+        check_array("StoredSequence.T_world_cam", self.T_world_cam, (count, 4, 4))
+        check_pose("StoredSequence.T_world_cam", self.T_world_cam, tolerance=1e-4)
+        check_increasing("StoredSequence.stamps_ns", self.stamps_ns)
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def starts(self, pairs: int) -> Stamps:
+        """Numbers (K,) of the images at which a window of ``pairs`` pairs may begin."""
+        steps = np.diff(self.stamps_ns)
+        if len(steps) < pairs:
+            return np.zeros(0, dtype=np.int64)
+        sound = (steps <= _LONGEST_STEP * np.median(steps)) & self.known[:-1] & self.known[1:]
+        run = np.concatenate([[0], np.cumsum(sound)])
+        starts: Stamps = np.flatnonzero(run[pairs:] - run[:-pairs] == pairs)
+        return starts
+
+    def motions(self) -> Array:
+        """True motion (F - 1, 4, 4) of the camera over each pair; meaningless where a pose is unknown."""
+        return se3.inverse(self.T_world_cam[:-1]) @ self.T_world_cam[1:]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrainingWindow:
+    """S pairs of consecutive images with the inertial samples between them and the true motion.
+
+    Attributes:
+        images: (S + 1, H, W, C) uint8.
+        stamps_ns: (S + 1,) IMU clock.
+        T_prev_cur: (S, 4, 4) motion of camera 0, metres.
+        imu: for each pair (N, 6) gyro rad/s and specific force m/s², body; the ends lie at the images; N may be 0.
+        imu_time_s: for each pair (N,) seconds since its first image.
+        intrinsics_px: (4,) fx, fy, cx, cy.
+        T_body_cam: (4, 4).
+        gravity: m/s².
+        recording: number of the recording in the split.
+        start: number of the first image in the recording.
+    """
+
+    images: Image
+    stamps_ns: Stamps
+    T_prev_cur: Array
+    imu: tuple[Array, ...]
+    imu_time_s: tuple[Array, ...]
+    intrinsics_px: Array
+    T_body_cam: Array
+    gravity: float
+    recording: int = 0
+    start: int = 0
+
+    @property
+    def pairs(self) -> int:
+        """S."""
+        return len(self.T_prev_cur)
+
+
+def cut_window(sequence: StoredSequence, start: int, pairs: int, recording: int = 0) -> TrainingWindow:
+    """The window of ``pairs`` pairs that begins at image ``start``; its images are a copy."""
+    stop = start + pairs + 1
+    stamps = sequence.stamps_ns[start:stop]
+    poses = sequence.T_world_cam[start:stop]
+    blocks = [_between(sequence.imu, int(a), int(b)) for a, b in itertools.pairwise(stamps)]
+    return TrainingWindow(
+        images=np.array(sequence.images[start:stop]),
+        stamps_ns=stamps.astype(np.int64),
+        T_prev_cur=se3.inverse(poses[:-1]) @ poses[1:],
+        imu=tuple(samples for samples, _ in blocks),
+        imu_time_s=tuple(times for _, times in blocks),
+        intrinsics_px=sequence.camera.intrinsics_px,
+        T_body_cam=sequence.camera.T_body_cam,
+        gravity=sequence.gravity,
+        recording=recording,
+        start=start,
+    )
+
+
+def _between(imu: ImuBlock | None, first_ns: int, last_ns: int) -> tuple[Array, Array]:
+    """Samples (N, 6), times (N,) s, with one exactly at both ends, interpolated; none where some are missing."""
+    if imu is None or len(imu) < 2 or imu.stamps_ns[0] > first_ns or imu.stamps_ns[-1] < last_ns:
+        return np.zeros((0, 6)), np.zeros(0)
+    inner = slice(
+        int(np.searchsorted(imu.stamps_ns, first_ns, side="right")), int(np.searchsorted(imu.stamps_ns, last_ns))
+    )
+    stamps = np.concatenate([[first_ns], imu.stamps_ns[inner], [last_ns]])
+    # Relative to the pair before they become floats: absolute nanoseconds would lose digits.
+    around = slice(max(inner.start - 1, 0), inner.stop + 1)
+    known_s = (imu.stamps_ns[around] - first_ns) / NANOSECONDS
+    time_s = (stamps - first_ns) / NANOSECONDS
+    values = np.concatenate([imu.gyro[around], imu.accel[around]], axis=1)
+    samples = np.stack([np.interp(time_s, known_s, values[:, axis]) for axis in range(6)], axis=1)
+    return samples, time_s
+
+
+class WindowIndex:
+    """All windows of some recordings, in order.
+
+    Args:
+        sequences: of one split.
+        pairs: pairs of images in each window.
+        stride: images from the start of one window to that of the next.
+        split: what the recordings are for, for messages.
+
+    Raises:
+        ConfigError: ``pairs`` or ``stride`` below 1.
+        DataError: recordings whose images differ in size or colour; no window at all.
+    """
+
+    def __init__(self, sequences: Sequence[StoredSequence], pairs: int, *, stride: int = 1, split: str) -> None:
+        if pairs < 1 or stride < 1:
+            raise ConfigError(f"trainer.pairs and the stride must be 1 or more, got {pairs} and {stride}")
+        shapes = {sequence.images.shape[1:]: sequence.name for sequence in sequences}
+        if len(shapes) > 1:
+            told = ", ".join(f"{name} has {shape[1]}×{shape[0]}×{shape[2]}" for shape, name in shapes.items())
+            raise DataError(f"the recordings for {split} must all give images of one size, but {told}")
+        self.sequences = tuple(sequences)
+        self.pairs = pairs
+        found = [sequence.starts(pairs)[::stride] for sequence in sequences]
+        self._recording = np.repeat(np.arange(len(found)), [len(starts) for starts in found])
+        self._start = np.concatenate([*found, np.zeros(0, dtype=np.int64)])
+        if len(self._start) == 0:
+            told = ", ".join(f"{sequence.name} has {len(sequence)} images" for sequence in sequences) or "none is given"
+            raise DataError(
+                f"no window of {pairs + 1} consecutive images with known motion in the recordings for {split} "
+                f"({told}): give longer ones, or a smaller trainer.pairs"
+            )
+
+    def __len__(self) -> int:
+        return len(self._start)
+
+    def __getitem__(self, index: int) -> TrainingWindow:
+        recording = int(self._recording[index])
+        return cut_window(self.sequences[recording], int(self._start[index]), self.pairs, recording)
+
+    def tiled(self, advance: int) -> Self:
+        """The windows that cover each unbroken run of images once, when each answers for its last ``advance`` pairs.
+
+        The last window of a run is moved back so that it ends with it; what it answers again is the same.
+        """
+        kept: list[int] = []
+        for recording in range(len(self.sequences)):
+            members = np.flatnonzero(self._recording == recording)
+            starts = self._start[members]
+            for run in np.split(np.arange(len(starts)), np.flatnonzero(np.diff(starts) != 1) + 1):
+                if len(run):
+                    chosen = [*run[:-1:advance], run[-1]]
+                    kept += [int(members[number]) for number in chosen]
+        other = object.__new__(type(self))
+        other.sequences, other.pairs = self.sequences, self.pairs
+        other._recording, other._start = self._recording[kept], self._start[kept]
+        return other
+
+
+def check_split(training: Sequence[str], validation: Sequence[str]) -> None:
+    """Refuse a recording that is in both splits.
+
+    Raises:
+        ConfigError: with its name.
+    """
+    both = sorted(set(training) & set(validation))
+    if both:
+        raise ConfigError(
+            f"training_data: {', '.join(both)} is both trained on and validated with: give each recording one purpose"
+        )
