@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vioframe.checks import Array, Stamps
+from vioframe.checks import Array, Mask, Stamps
 from vioframe.conventions import NANOSECONDS
 from vioframe.data.recording import Recording
 from vioframe.data.simulator.cameras import CameraSettings
@@ -119,6 +119,19 @@ class DrawnRecording(Recording):
             images = self.imager.images(float(self.elapsed_s(stamp_ns))) if self._camera.images else ()
             yield Frame(stamp_ns=int(stamp_ns) - self._rig.camera_delay_ns, images=images)
         yield from cutter.until(None)
+
+    def exact_flow(self, first_ns: int, second_ns: int, camera: int = 0) -> tuple[Array, Mask]:
+        """Where the pixels of one image are in another, without error.
+
+        Args:
+            first_ns, second_ns: instants, IMU clock, such as two of :attr:`frame_stamps_ns`; in any order.
+            camera: of the rig.
+
+        Returns:
+            displacement (H, W, 2) px on the grid of the first image, and seen (H, W): False where the point leaves
+            the image, is hidden in the second, or the camera is blind.
+        """
+        return self.imager.flow(float(self.elapsed_s(first_ns)), float(self.elapsed_s(second_ns)), camera)
 
     @abstractmethod
     def _blocks(self) -> Iterator[ImuBlock]:

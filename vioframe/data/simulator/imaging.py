@@ -4,19 +4,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vioframe.checks import Array
+from vioframe.checks import Array, Mask
 from vioframe.data.simulator.building import build_building
 from vioframe.data.simulator.cameras import CameraSettings
 from vioframe.data.simulator.degrade import Degradations
 from vioframe.data.simulator.drive import BODY_HEIGHT_M
+from vioframe.data.simulator.flow import Sight, exact_flow
 from vioframe.data.simulator.plan import PlannedMotion
 from vioframe.data.simulator.render import Renderer, View
 from vioframe.data.simulator.rooms import PATH_STEP_S, build_room
 from vioframe.data.simulator.street import build_street
 from vioframe.data.simulator.texture import Atlas
 from vioframe.data.simulator.world import World, WorldPlan
-from vioframe.geometry import camera as camera_models
-from vioframe.geometry import se3
 from vioframe.types import Camera
 
 # Photo-electrons of a full pixel, and noise of the read-out in grey values, of a small global-shutter sensor at
@@ -108,25 +107,21 @@ class Imager:
         self.world.move_to(t_s)
         return self._renderers[camera].render(self._pose(camera, t_s), smooth_edges=False).depth
 
-    def flow(self, t_s: float, later_s: float, camera: int = 0) -> tuple[Array, np.ndarray]:
-        """Where the pixels of one instant are at a later one: displacement (H, W, 2) px, and seen (H, W).
+    def flow(self, t_s: float, later_s: float, camera: int = 0) -> tuple[Array, Mask]:
+        """Where the pixels of one instant are at another: displacement (H, W, 2) px, and seen (H, W).
 
-        ``seen`` is False where the point leaves the image, is hidden later, or the camera is blind. Points on
-        moving objects are taken as at rest.
+        Exact for every camera model, for objects that move and for a shutter that rolls; ``later_s`` may also be
+        the earlier of the two. ``seen`` is False where the point leaves the image, is hidden at the other instant,
+        or the camera is blind.
         """
-        model = self._cameras[camera]
-        width, height = model.size_px
-        depth = self.depth(t_s, camera).astype(float)
-        grid = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), axis=-1)
-        ideal = camera_models.normalised(model, grid)
-        points = np.concatenate([ideal, np.ones((height, width, 1))], axis=-1) * depth[..., None]
-        T_later_now = se3.inverse(self._pose(camera, later_s)) @ self._pose(camera, t_s)
-        moved = se3.transform(T_later_now, points.reshape(-1, 3)).reshape(height, width, 3)
-        pixels, inside = camera_models.project(model, moved)
-        later_depth = self.depth(later_s, camera)
-        nearest = np.clip(np.round(np.where(inside[..., None], pixels, 0.0)).astype(int), 0, (width - 1, height - 1))
-        visible = moved[..., 2] < 1.03 * later_depth[nearest[..., 1], nearest[..., 0]] + 0.02
-        return pixels - grid, inside & visible & (depth > 0.0)
+        moved = self.world.offsets(later_s) - self.world.offsets(t_s)
+        return exact_flow(self._cameras[camera], self._sight(t_s, camera), self._sight(later_s, camera), moved)
+
+    def _sight(self, t_s: float, camera: int) -> Sight:
+        self.world.move_to(t_s)
+        pose = self._pose(camera, t_s)
+        view = self._renderers[camera].render(pose, smooth_edges=False)
+        return Sight(depth=view.depth, face=view.face, T_world_cam=pose)
 
     def _pose(self, camera: int, t_s: float) -> Array:
         """T_world_cam (4, 4), or (H, 4, 4) under a rolling shutter."""

@@ -115,13 +115,18 @@ class World:
         """Put the moving solids where they are at a time in s."""
         if not self._moving:
             return
-        first = len(self.low) - len(self._moving)
-        for index, (amplitude, period_s, phase) in enumerate(self._moving):
-            offset = swing(amplitude, period_s, phase, np.array(t_s))
-            self.low[first + index] = self._rest_low[first + index] + offset
-            self.high[first + index] = self._rest_high[first + index] + offset
+        offsets = self.offsets(t_s)
+        self.low, self.high = self._rest_low + offsets, self._rest_high + offsets
         # Textures of moving solids go with them since they are fitted.
         self._arrange()
+
+    def offsets(self, t_s: float) -> Array:
+        """By how much each solid (S, 3) m is off its place of rest at a time in s."""
+        offsets = np.zeros_like(self._rest_low)
+        first = len(offsets) - len(self._moving)
+        for index, (amplitude, period_s, phase) in enumerate(self._moving):
+            offsets[first + index] = swing(amplitude, period_s, phase, np.array(t_s))
+        return offsets
 
     def relative_limits(self, origin: Array) -> tuple[Array, Array, Array, Array, Array]:
         """Distance along the normal's axis, and limits u_low, u_high, v_low, v_high (F,), as seen from a point (3,)."""
