@@ -1,0 +1,1 @@
+"""Learned odometry: two-stream TSVO with three backbones, and DeepVO. Importing this package imports no torch."""
