@@ -88,6 +88,21 @@ class Augmentation:
         self._contrast = contrast
         self._gamma = gamma
 
+    def settings(self) -> dict[str, object]:
+        """The options as plain values, for the record."""
+        return {
+            "reverse": self._reverse,
+            "mirror": self._mirror,
+            "blur": self._blur,
+            "blur_sigma_px": list(self._sigmas),
+            "salt_pepper": self._salt_pepper,
+            "salt_pepper_share": self._salt_pepper_share,
+            "photometric": self._photometric,
+            "brightness": self._brightness,
+            "contrast": self._contrast,
+            "gamma": self._gamma,
+        }
+
     def apply(self, window: TrainingWindow, rng: np.random.Generator) -> TrainingWindow:
         """A changed window; the one given is left as it is."""
         # Drawn in any case, so that switching one change off does not change the others.

@@ -1,0 +1,268 @@
+"""From parts and recordings to weights: one call."""
+
+import hashlib
+import json
+import logging
+import math
+import pickle
+import signal
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import lightning
+import numpy as np
+import torch
+from lightning.pytorch.accelerators import CUDAAccelerator
+from lightning.pytorch.callbacks import Callback
+
+from vioframe import __version__
+from vioframe.data.windows import StoredSequence, WindowIndex
+from vioframe.errors import DataError
+from vioframe.interfaces import Trainable
+from vioframe.learning.callbacks import Bar, BestWeights, Curve, ResumePoint, Row, StopDivergence
+from vioframe.learning.datamodule import WindowData
+from vioframe.learning.module import TrainingModule
+from vioframe.learning.options import TrainerOptions
+from vioframe.learning.scoring import Score, mean_motion, score_motions
+from vioframe.learning.weights import load_weights, read_card
+from vioframe.tracking import Tracker
+
+log = logging.getLogger(__name__)
+
+_PROTOCOL = (
+    "trajectory of camera 0, causal, no alignment; mean over segments of the given lengths; validation recordings, "
+    "which also chose these weights"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Split:
+    """Recordings of one purpose.
+
+    Attributes:
+        sequences: decoded.
+        hashes: of the content of each.
+    """
+
+    sequences: tuple[StoredSequence, ...]
+    hashes: tuple[str, ...]
+
+    def about(self) -> list[dict[str, object]]:
+        """For the card."""
+        pairs = zip(self.sequences, self.hashes, strict=True)
+        return [{"name": one.name, "images": len(one), "sha256": content} for one, content in pairs]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trained:
+    """What came out.
+
+    Attributes:
+        weights: file of the best weights, by slot; empty if no validation was reached.
+        score: of the best, on the validation recordings.
+        constant: of constant motion on the same.
+        epochs: that were completed, those of a resumed run included.
+        curve: one row an epoch.
+    """
+
+    weights: Mapping[str, Path]
+    score: Score | None
+    constant: Score
+    epochs: int
+    curve: Sequence[Row]
+
+
+def train_parts(
+    parts: Mapping[str, Trainable],
+    training: Split,
+    validation: Split,
+    options: TrainerOptions,
+    *,
+    folder: Path,
+    tracker: Tracker,
+    about: Mapping[str, object],
+    shown: bool,
+) -> Trained:
+    """Train the parts together, and leave each with its best weights.
+
+    Args:
+        parts: by slot, in the order of the pipeline.
+        training, validation: recordings.
+        options: of the training.
+        folder: of weights, curve and resume file.
+        tracker: that records the curve.
+        about: what the card should say of how the parts were configured.
+        shown: whether to show a progress bar.
+
+    Raises:
+        ConfigError: an option that cannot work, or a learning rate that diverges.
+        DataError: recordings that are too short, or a resume file that does not fit.
+        KeyboardInterrupt: the user stopped it; weights and resume file are those of the last epoch.
+    """
+    pairs = options.pairs or max(part.context_pairs for part in parts.values())
+    context = max(part.context_pairs for part in parts.values())
+    train_index = WindowIndex(training.sequences, max(pairs, context), split="training")
+    validation_index = WindowIndex(validation.sequences, max(pairs, context), split="validation")
+    constant = _constant_score(training, validation, options)
+    seed_everything(options.seed)
+    module = TrainingModule(parts, options, validation.sequences, constant)
+    data = WindowData(
+        train_index,
+        validation_index.tiled(max(pairs, context) - context + 1),
+        augmentation=options.augmentation,
+        batch_size=options.batch_size,
+        epoch_windows=options.epoch_windows,
+        seed=options.seed,
+        workers=options.workers,
+    )
+    base = _card(training, validation, options, about, constant)
+    trained = {slot: part for slot, part in parts.items() if options.train is None or slot in options.train}
+    best = BestWeights(folder / "weights", trained, options.top_k, lambda module: {**base, **_figures(module, options)})
+    curve = Curve(folder, tracker)
+    # The bar comes first, to be gone when another raises; the curve before what is saved; the resume point last.
+    watchers: list[Callback] = [Bar()] if shown else []
+    watchers += [StopDivergence(options.divergence_factor, options.learning_rate), best, curve, ResumePoint(folder)]
+    folder.mkdir(parents=True, exist_ok=True)
+    trainer = _trainer(options, folder, watchers)
+    _fit(trainer, module, data, options)
+    return _result(best, curve, trained, constant)
+
+
+def seed_everything(seed: int) -> None:
+    """Seed numpy, Python and torch, on every device."""
+    lightning.seed_everything(seed, workers=True, verbose=False)
+
+
+def _constant_score(training: Split, validation: Split, options: TrainerOptions) -> Score:
+    motion = mean_motion(training.sequences)
+    return score_motions(
+        validation.sequences,
+        [np.tile(motion, (len(sequence) - 1, 1, 1)) for sequence in validation.sequences],
+        [np.ones(len(sequence) - 1, dtype=np.bool_) for sequence in validation.sequences],
+        lengths_m=[float(length) for length in options.segment_lengths_m],
+        step=options.segment_step,
+    )
+
+
+def _trainer(options: TrainerOptions, folder: Path, callbacks: list[Callback]) -> lightning.Trainer:
+    gpu = options.accelerator != "cpu" and torch.cuda.is_available()
+    precision: Any = {"32": "32-true", "bf16": "bf16-mixed", "16": "16-mixed"}.get(str(options.precision), "32-true")
+    if options.precision == "auto" and gpu and torch.cuda.is_bf16_supported():
+        precision = "bf16-mixed"
+    if gpu:
+        torch.set_float32_matmul_precision("high")
+    with _quiet():
+        return lightning.Trainer(
+            accelerator=options.accelerator,
+            devices=options.devices,
+            strategy="ddp" if options.devices > 1 else "auto",
+            precision=precision,
+            max_epochs=options.max_epochs,
+            max_time=None if options.max_minutes is None else timedelta(minutes=options.max_minutes),
+            gradient_clip_val=options.gradient_clip or None,
+            check_val_every_n_epoch=min(options.validate_every, options.max_epochs),
+            num_sanity_val_steps=0,
+            default_root_dir=folder,
+            callbacks=callbacks,
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            use_distributed_sampler=False,
+            # Convolutions of one fixed size: trying their variants once pays.
+            benchmark=gpu,
+        )
+
+
+def _fit(trainer: lightning.Trainer, module: TrainingModule, data: WindowData, options: TrainerOptions) -> None:
+    if isinstance(trainer.accelerator, CUDAAccelerator):
+        for parameter in module.nets.parameters():
+            if parameter.ndim == 4:
+                parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+    resume = None if options.resume is None else Path(options.resume).expanduser()
+    if resume is not None and not resume.is_file():
+        raise DataError(f"trainer.resume={options.resume}: there is no such file; a run writes resume.ckpt each epoch")
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        with _quiet():
+            # Weights-only: the file is data, and one that holds anything else is refused.
+            trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
+    except SystemExit as error:
+        # Lightning ends the process after Ctrl-C; what it was called from has things to close first.
+        raise KeyboardInterrupt from error
+    except (pickle.UnpicklingError, EOFError) as error:
+        raise DataError(
+            f"trainer.resume={options.resume} is not a whole resume file of vioframe: begin anew"
+        ) from error
+    except (RuntimeError, KeyError, ValueError) as error:
+        # torch says all of these of a file that is cut or of another net; once a step is done they are bugs.
+        if resume is None or module.started:
+            raise
+        first = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise DataError(
+            f"trainer.resume={options.resume} does not fit these parts or is not whole ({first}): resume with the "
+            "configuration of the run that wrote it, or begin anew"
+        ) from error
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _result(best: BestWeights, curve: Curve, trained: Mapping[str, Trainable], constant: Score) -> Trained:
+    weights: dict[str, Path] = {}
+    score = None
+    if best.best:
+        epoch = best.best[0][1]
+        weights = {slot: best.path(slot, epoch) for slot in trained}
+        for slot, part in trained.items():
+            load_weights(weights[slot], part, f"{slot}.weights")
+            part.net.eval()
+        figures = read_card(next(iter(weights.values())))["validation"]
+        score = Score(**{each.name: figures[each.name] for each in fields(Score)})
+    return Trained(weights=weights, score=score, constant=constant, epochs=len(curve.rows), curve=curve.rows)
+
+
+def _card(
+    training: Split, validation: Split, options: TrainerOptions, about: Mapping[str, object], constant: Score
+) -> dict[str, object]:
+    data = {"training": training.about(), "validation": validation.about()}
+    return {
+        "data": data,
+        "split_sha256": hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest(),
+        "code": {"vioframe": __version__, "torch": torch.__version__, "lightning": lightning.__version__},
+        "licence": "Apache-2.0",
+        "made": datetime.now(UTC).isoformat(timespec="seconds"),
+        "trainer": options.settings(),
+        "constant_motion": asdict(constant),
+        **about,
+    }
+
+
+def _figures(module: TrainingModule, options: TrainerOptions) -> dict[str, object]:
+    score = module.score
+    if score is None:
+        return {}
+    figures = {**asdict(score), "relative_to_constant_motion": module.rank_value}
+    lengths = [float(length) for length in options.segment_lengths_m]
+    finite = {name: value if math.isfinite(value) else None for name, value in figures.items()}
+    return {"validation": {**finite, "segment_lengths_m": lengths, "protocol": _PROTOCOL}}
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Lightning tells at length which devices it found and what it would advise; the task says what matters."""
+    chatty = logging.getLogger("lightning.pytorch"), logging.getLogger("lightning.fabric")
+    levels = [logger.level for logger in chatty]
+    for logger in chatty:
+        logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module=r"lightning\..*")
+            yield
+    finally:
+        for logger, level in zip(chatty, levels, strict=True):
+            logger.setLevel(level)
