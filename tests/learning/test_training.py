@@ -79,6 +79,7 @@ def test_a_killed_run_that_is_resumed_has_the_same_curve(tmp_path, stop):
         if step == 2 and stop == "between":
             raise Killed
 
+    seed_everything(0)
     part = TinyVo()
     if stop == "within":
         steps = []

@@ -127,8 +127,8 @@ def write_rows(path: Path, rows: list[Row]) -> None:
 class StopDivergence(Callback):
     """Stops a training whose loss is not finite or has left where it began.
 
-    With block means L of the loss over ten steps, the first of them L₀ and the least so far L*, it stops when
-    ``L > L* + factor · max(|L₀|, |L*|)``: a loss with learned log-variances may well be negative.
+    With block means L of the loss over ten steps, L* the least of them so far and L₀ the loss of the very first step,
+    it stops when ``L > L* + factor · max(|L₀|, |L*|)``: a loss with learned log-variances may well be negative.
 
     Args:
         factor: see above.
@@ -160,11 +160,13 @@ class StopDivergence(Callback):
         self._block.append(outputs["loss"].detach().float())
         if len(self._block) < _BLOCK and not trainer.is_last_batch:
             return
-        mean = float(torch.stack(self._block).mean())
+        block = torch.stack(self._block)
+        mean = float(block.mean())
         self._block = []
         if self._first is None:
-            self._first = mean
-        limit = self._least + self._factor * max(abs(self._first), abs(self._least))
+            # Before any step was taken: a wild learning rate shows within the first block.
+            self._first = float(block[0])
+        limit = min(self._least, self._first) + self._factor * max(abs(self._first), abs(min(self._least, self._first)))
         if not math.isfinite(mean) or mean > limit:
             was = "" if math.isinf(self._least) else f", after {self._least:.3g} at best"
             raise ConfigError(

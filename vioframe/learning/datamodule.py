@@ -154,6 +154,8 @@ class WindowData(lightning.LightningDataModule):
             persistent_workers=helped,
             prefetch_factor=4 if helped else None,
             pin_memory=torch.cuda.is_available(),
+            # Of its own: one that it shared with dropout would be moved on by each start of the workers.
+            generator=torch.Generator().manual_seed(self._seed),
             worker_init_fn=_calm if helped else None,
         )
 

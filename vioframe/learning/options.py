@@ -39,7 +39,7 @@ class TrainerOptions:
         warmup_steps: over which the learning rate rises from zero.
         gradient_clip: largest norm of the gradient; 0 for no limit.
         divergence_factor: training stops when the loss, averaged over ten steps, exceeds its least value so far by
-            this many times the size of the first (or of the least, if that is larger).
+            this many times the size of the very first step's (or of the least, if that is larger).
         top_k: weights kept, by the score on the validation recordings.
         validate_every: epochs from one validation to the next.
         segment_lengths_m: of t_rel and r_rel on the validation recordings.

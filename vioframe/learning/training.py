@@ -199,7 +199,7 @@ def _fit(trainer: lightning.Trainer, module: TrainingModule, data: WindowData, o
         raise DataError(
             f"trainer.resume={options.resume} is not a whole resume file of vioframe: begin anew"
         ) from error
-    except (RuntimeError, KeyError, ValueError) as error:
+    except (OSError, RuntimeError, KeyError, ValueError) as error:
         # torch says all of these of a file that is cut or of another net; once a step is done they are bugs.
         if resume is None or module.started:
             raise
