@@ -2,11 +2,7 @@
 
 import json
 import logging
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -24,15 +20,13 @@ from vioframe.evaluation.run import SequenceRun
 from vioframe.evaluation.table import print_rows
 from vioframe.pipeline import Pipeline
 from vioframe.sweep import write_status
+from vioframe.tasks.interruption import INTERRUPTED, terminate_like_interrupt
 from vioframe.tasks.progress import frame_progress
 from vioframe.tasks.run_sequence import Recorder, run_sequence
 from vioframe.tracking import Tracker, metrics_of
 from vioframe.viewer import Viewer, build_viewer
 
 log = logging.getLogger(__name__)
-
-# As shells have it: 128 + SIGINT.
-INTERRUPTED = 130
 
 
 def run(config: DictConfig) -> int:
@@ -56,7 +50,7 @@ def run(config: DictConfig) -> int:
     tags["faults"] = ", ".join(build(config, "faults", Faults).describe()) or "none"
     parameters = {str(key): value for key, value in plain.items()} if isinstance(plain, dict) else {}
     experiment = _Experiment(config, folder, options, pipeline, dataset, tracker, viewer, choices)
-    with _terminate_like_interrupt(), tracker:
+    with terminate_like_interrupt(), tracker:
         tracker.start(parameters, tags, name=_run_name(pipeline, choices))
         status = experiment.run(in_sweep=hydra_config.mode == RunMode.MULTIRUN)
         if status == INTERRUPTED:
@@ -197,22 +191,3 @@ def _unopened(name: str, error: str) -> SequenceRun:
     return SequenceRun(
         sequence=name, states=[], frames_expected=0, duration_s=0.0, pipeline_s=0.0, windows=0, wall_s=0.0, error=error
     )
-
-
-@contextmanager
-def _terminate_like_interrupt() -> Iterator[None]:
-    """Treat SIGTERM, which schedulers send, as Ctrl-C: what there is gets saved."""
-
-    def interrupt(signum: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    try:
-        before = signal.signal(signal.SIGTERM, interrupt)
-    except ValueError:
-        # Only the main thread may set handlers; elsewhere a scheduler's signal is not ours to take.
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
