@@ -216,7 +216,10 @@ class Trainable(Protocol):
             ``{"part": "tsvo", "backbone": "resnet50", "stack": 10}``.
     """
 
-    net: "nn.Module"
+    @property
+    def net(self) -> "nn.Module":
+        """See the class."""
+        ...
 
     @property
     def context_pairs(self) -> int:

@@ -20,7 +20,7 @@ class LearnedWeights(nn.Module):
 
     ``L = L_t exp(−s_t) + s_t + L_r exp(−s_r) + s_r`` (Kendall & Cipolla, CVPR 2017, eq. 4; Zhao et al. 2022, eq. 7).
     At its minimum each s is the logarithm of its error, and the loss 2 + log L_t + log L_r: negative values are good
-    news. Weight decay must not reach the two parameters.
+    news. A weight decay that reaches the two draws them to zero; the optimiser ``adamw`` of the trainer spares them.
     """
 
     def __init__(self, *, log_variance_translation: float = 0.0, log_variance_rotation: float = -3.0) -> None:

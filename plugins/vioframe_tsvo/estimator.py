@@ -1,0 +1,297 @@
+"""What learned estimators have in common: weights, device, images, losses, and numbers into motions."""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, ClassVar
+
+import cv2
+import numpy as np
+
+from vioframe.checks import check_positive
+from vioframe.errors import ConfigError, DataError, StateError
+from vioframe.interfaces import CONSISTENT_SCALE, IMAGES, METRIC_SCALE, RELATIVE_POSE, VOEstimator
+from vioframe.learning import require_torch
+from vioframe.types import Frame, Image, RelativePose, SensorRig
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor, nn
+
+    from vioframe.learning.batch import WindowBatch
+    from vioframe_tsvo.net.motion import Rotation
+    from vioframe_tsvo.net.two_stream import MotionEstimate
+
+_CHOICES = {
+    "rotation": ("log", "euler"),
+    "loss": ("learned", "fixed", "likelihood"),
+    "device": ("auto", "cpu", "cuda"),
+}
+# What OpenCV weighs red, green and blue with (ITU-R BT.601).
+_GRAY = (0.299, 0.587, 0.114)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionOptions:
+    """Options of every learned estimator, checked.
+
+    Attributes:
+        size_px: (width, height) to which images are brought.
+        gray: take images in grey, even where the camera has colour.
+        rotation: what three numbers of rotation mean: ``log`` or ``euler``.
+        rotation_unit_rad, translation_unit_m: what an output of 1 means.
+        loss: ``learned`` weights, ``fixed`` ones, or the ``likelihood`` of a Gaussian with the variances stated.
+        rotation_weight: of the fixed ones, m²/rad².
+        weights: file of trained weights, in MLflow too, or None.
+        device: ``cpu``, ``cuda``, or ``auto`` for the latter where there is one.
+
+    Raises:
+        ConfigError: with the key and its value.
+    """
+
+    size_px: Sequence[int]
+    gray: bool
+    rotation: "Rotation"
+    rotation_unit_rad: float
+    translation_unit_m: float
+    loss: str
+    rotation_weight: float
+    weights: str | None
+    device: str
+
+    def __post_init__(self) -> None:
+        check_size("vo.size_px", self.size_px)
+        check_positive(
+            "vo",
+            rotation_unit_rad=self.rotation_unit_rad,
+            translation_unit_m=self.translation_unit_m,
+            rotation_weight=self.rotation_weight,
+        )
+        for name, allowed in _CHOICES.items():
+            if getattr(self, name) not in allowed:
+                raise ConfigError(f"vo.{name} must be one of {', '.join(allowed)}, got {getattr(self, name)!r}")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height)."""
+        return self.size_px[0], self.size_px[1]
+
+    @property
+    def log_variances(self) -> bool:
+        """Whether the net states variances: only the likelihood teaches it to."""
+        return self.loss == "likelihood"
+
+    def architecture(self) -> dict[str, str | int | float | bool]:
+        """What of it a file of weights must agree with."""
+        return {
+            "width_px": self.size[0],
+            "height_px": self.size[1],
+            "gray": self.gray,
+            "rotation": self.rotation,
+            "rotation_unit_rad": self.rotation_unit_rad,
+            "translation_unit_m": self.translation_unit_m,
+            "loss": self.loss,
+        }
+
+
+class LearnedVO(VOEstimator):
+    """An estimator with a net; metric, since it has learned how far its camera moves.
+
+    Args:
+        name: the option of the group ``vo``, for messages.
+        options: what it shares with the other.
+
+    Raises:
+        ConfigError: torch is missing.
+    """
+
+    requires: ClassVar[frozenset[str]] = frozenset({IMAGES})
+    provides: ClassVar[frozenset[str]] = frozenset({RELATIVE_POSE, CONSISTENT_SCALE, METRIC_SCALE})
+
+    def __init__(self, name: str, options: MotionOptions) -> None:
+        require_torch(f"vo={name}")
+        self._name = name
+        self._options = options
+        self._seen: tuple[Frame, Tensor] | None = None
+        self._ready = False
+
+    @cached_property
+    def net(self) -> "nn.Module":
+        """``motion``, the network, and ``weighing``, its loss; made when first asked for: torch is slow to import.
+
+        Raises:
+            ConfigError: there is no such file of weights.
+            DataError: the file is of another architecture, or damaged.
+        """
+        from torch import nn
+
+        from vioframe_tsvo.net.losses import FixedWeights, GaussianLikelihood, LearnedWeights
+
+        weighing: nn.Module
+        if self._options.loss == "learned":
+            weighing = LearnedWeights()
+        elif self._options.loss == "fixed":
+            weighing = FixedWeights(rotation_weight=self._options.rotation_weight)
+        else:
+            weighing = GaussianLikelihood()
+        net = nn.ModuleDict({"motion": self.make_motion_net(), "weighing": weighing}).eval()
+        if self._options.weights is not None:
+            from vioframe.learning.weights import load_weights, locate_weights
+
+            # The file is held against a part, which this one is as soon as it has its net.
+            self.__dict__["net"] = net
+            try:
+                load_weights(locate_weights(self._options.weights, "vo.weights"), self, "vo.weights")
+            except BaseException:
+                del self.__dict__["net"]
+                raise
+        return net
+
+    @property
+    @abstractmethod
+    def context_pairs(self) -> int:
+        """Pairs of images in a row that one answer takes in training."""
+
+    @property
+    @abstractmethod
+    def architecture(self) -> Mapping[str, str | int | float | bool]:
+        """What a file of weights must agree with."""
+
+    @abstractmethod
+    def make_motion_net(self) -> "nn.Module":
+        """The network, with random weights."""
+
+    @abstractmethod
+    def forward_batch(self, batch: "WindowBatch", upstream: "Mapping[str, Tensor]") -> "dict[str, Tensor]":
+        """See :class:`vioframe.interfaces.Trainable`."""
+
+    def setup(self, rig: SensorRig) -> None:
+        """Forget the last sequence and bring the net to its device.
+
+        Raises:
+            ConfigError: a GPU or a file of weights that is not there.
+            DataError: the rig has no camera; the file of weights cannot be used.
+        """
+        if not rig.cameras:
+            raise DataError(f"vo={self._name} needs a camera, but the recording's calibration has none")
+        self.net.to(self._device()).eval()
+        self._seen = None
+        self._ready = True
+
+    def loss(self, outputs: "Mapping[str, Tensor]", batch: "WindowBatch") -> "dict[str, Tensor]":
+        """``loss``, and mean squared errors in units of the output, against the last motions of each window."""
+        from vioframe_tsvo.net.motion import vector_from_motion
+
+        vector = outputs["motion"]
+        target = vector_from_motion(batch.T_prev_cur[:, -vector.shape[1] :], self._options.rotation)
+        pair = (vector, target) if not self._options.log_variances else (vector, target, outputs["log_variances"])
+        losses: dict[str, Tensor] = self.net.get_submodule("weighing")(*pair)
+        return losses
+
+    def outputs(self, estimate: "MotionEstimate", answered: int) -> "dict[str, Tensor]":
+        """What :meth:`forward_batch` returns: vectors in rad and metres, and the last ``answered`` as motions."""
+        from vioframe_tsvo.net.motion import motion_from_vector
+
+        vector, log_variances = self._scaled(estimate)
+        named = {"motion": vector, "T_prev_cur": motion_from_vector(vector[:, -answered:], self._options.rotation)}
+        return named if log_variances is None else {**named, "log_variances": log_variances}
+
+    def relative_pose(self, estimate: "MotionEstimate") -> RelativePose:
+        """The motion of one pair, from estimates of any leading axes of length one."""
+        from vioframe_tsvo.net.motion import covariance_from_log_variances, motion_from_vector, vector_from_motion
+
+        vector, log_variances = (None if each is None else each.reshape(6).double() for each in self._scaled(estimate))
+        if vector is None or not bool(vector.isfinite().all()):
+            return RelativePose.invalid()
+        T_prev_cur = motion_from_vector(vector, self._options.rotation)
+        covariance = None
+        if log_variances is not None:
+            # Small angles of either kind have the same errors to first order.
+            stated = covariance_from_log_variances(vector_from_motion(T_prev_cur), log_variances)
+            covariance = (0.5 * (stated + stated.T)).cpu().numpy()
+        return RelativePose(T_prev_cur=T_prev_cur.cpu().numpy(), covariance=covariance)
+
+    def pair(self, previous: Frame, current: Frame) -> "Tensor":
+        """Both images, (1, 6, H, W) in [0, 1], the earlier first, on the net's device.
+
+        Raises:
+            StateError: called before ``setup``.
+            DataError: a frame without an image.
+        """
+        import torch
+
+        if not self._ready:
+            raise StateError(f"{type(self).__name__}.estimate was called before setup(rig): set it up first")
+        before = self._seen[1] if self._seen is not None and self._seen[0] is previous else self._prepare(previous)
+        after = self._prepare(current)
+        self._seen = (current, after)
+        return torch.cat([before, after])[None]
+
+    def pairs_of_batch(self, batch: "WindowBatch") -> "Tensor":
+        """The same for a batch: (B, S, 6, H, W).
+
+        Raises:
+            ConfigError: its images have another size than the net's.
+        """
+        from vioframe_tsvo.net.two_stream import pairs_of
+
+        images = batch.images
+        self.check_training_size("trainer.size_px", images)
+        if self._options.gray and images.shape[2] == 3:
+            images = (images * images.new_tensor(_GRAY)[:, None, None]).sum(2, keepdim=True)
+        return pairs_of(images)
+
+    def check_training_size(self, key: str, maps: "Tensor") -> None:
+        """Refuse maps (..., H, W) of another size than the net's, which streaming would have resized.
+
+        Raises:
+            ConfigError: with the option ``key`` that made them so.
+        """
+        if tuple(maps.shape[:-3:-1]) != self._options.size:
+            (width, height), (made_width, made_height) = self._options.size, maps.shape[:-3:-1]
+            raise ConfigError(
+                f"{key} makes training see {made_width}×{made_height} px, but vo.size_px is {width}×{height}: "
+                "set them alike"
+            )
+
+    def _prepare(self, frame: Frame) -> "Tensor":
+        """(3, H, W) in [0, 1]."""
+        import torch
+
+        if not frame.images:
+            raise DataError(f"frame at {frame.stamp_ns} ns has no image, and vo={self._name} needs one")
+        image: Image = frame.images[0]
+        if self._options.gray and image.ndim == 3:
+            image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        if image.shape[1::-1] != self._options.size:
+            # As training images are resized: averages over areas, which leaves nothing to alias.
+            image = cv2.resize(image, self._options.size, interpolation=cv2.INTER_AREA)
+        channels = image[None].repeat(3, axis=0) if image.ndim == 2 else image.transpose(2, 0, 1)
+        return torch.from_numpy(np.ascontiguousarray(channels)).to(self._device()).float() / 255.0
+
+    def _scaled(self, estimate: "MotionEstimate") -> "tuple[Tensor, Tensor | None]":
+        """Vectors in rad and metres, and logarithms of rad² and m²."""
+        unit = [self._options.rotation_unit_rad] * 3 + [self._options.translation_unit_m] * 3
+        units = estimate.vector.new_tensor(unit)
+        if estimate.log_variances is None:
+            return estimate.vector * units, None
+        return estimate.vector * units, estimate.log_variances + 2.0 * units.log()
+
+    def _device(self) -> "torch.device":
+        import torch
+
+        there = torch.cuda.is_available()
+        if self._options.device == "cuda" and not there:
+            raise ConfigError("vo.device=cuda, but torch finds no such GPU here: use vo.device=auto or cpu")
+        return torch.device("cuda" if there and self._options.device != "cpu" else "cpu")
+
+
+def check_size(key: str, size_px: Sequence[int]) -> None:
+    """Refuse what is no (width, height).
+
+    Raises:
+        ConfigError: with the key and its value.
+    """
+    if len(size_px) != 2 or not all(isinstance(side, int) and side >= 16 for side in size_px):
+        raise ConfigError(f"{key} must be [width, height], whole numbers of at least 16, got {list(size_px)}")
