@@ -266,6 +266,11 @@ def _check_frontend(component: Component, scene: Scene) -> list[Array]:
             extras <= set(features.extras),
             f"{name} provides {sorted(extras)}, but extras has {sorted(features.extras)}",
         )
+        if features.flow is not None:
+            flow = features.flow
+            _expect(flow.ndim == 3 and flow.shape[2] == 2, f"{name}.flow must be (H, W, 2), got {flow.shape}")
+            _expect(bool(np.isfinite(flow).all()), f"{name}.flow must be finite")
+            results.append(flow)
         if features.tracks is not None:
             ids = features.tracks.ids
             _expect(len(np.unique(ids)) == len(ids), f"{name} gave one id to two tracks of one frame")

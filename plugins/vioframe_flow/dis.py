@@ -1,13 +1,22 @@
 """``frontend=dis``: dense inverse search, as in OpenCV."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from vioframe.errors import DataError
+from vioframe.interfaces import FLOW
+from vioframe.learning import require_torch
 from vioframe.types import SensorRig
 from vioframe_flow.frontend import FlowFrontend, require
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+    from vioframe.learning.batch import WindowBatch
 
 _PRESETS = {
     "ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
@@ -18,6 +27,9 @@ _PRESETS = {
 
 class DisFrontend(FlowFrontend):
     """Dense inverse search (Kroeger et al. 2016), then variational refinement.
+
+    It has nothing to learn, but takes part in training: its net is empty, and what comes after it learns from its
+    flow.
 
     Args:
         size_px: (width, height) to which images are brought first, and the size of the flow; None keeps the image.
@@ -32,6 +44,8 @@ class DisFrontend(FlowFrontend):
     Raises:
         ConfigError: an option outside its range.
     """
+
+    context_pairs = 1
 
     def __init__(
         self,
@@ -93,3 +107,34 @@ class DisFrontend(FlowFrontend):
             solver.getVariationalRefinementIterations(),
         )
         return f"dis {self._preset} {numbers} opencv {cv2.__version__}"
+
+    @cached_property
+    def net(self) -> "nn.Module":
+        """Nothing, as a module."""
+        require_torch("training with frontend=dis")
+        from torch import nn
+
+        return nn.Identity()
+
+    @property
+    def architecture(self) -> Mapping[str, str | int | float | bool]:
+        """Its name alone."""
+        return {"part": "dis"}
+
+    def forward_batch(self, batch: "WindowBatch", upstream: "Mapping[str, Tensor]") -> "dict[str, Tensor]":
+        """Flow of every pair of a batch, as streaming finds it.
+
+        Args:
+            batch: with images in [0, 1].
+            upstream: not used.
+
+        Returns:
+            ``"flow"``: (B, S, 2, H, W) px.
+        """
+        from vioframe_flow.batches import flow_of_batch
+
+        return {FLOW: flow_of_batch(self, batch)}
+
+    def loss(self, outputs: "Mapping[str, Tensor]", batch: "WindowBatch") -> "dict[str, Tensor]":
+        """None: there is nothing to learn."""
+        return {}

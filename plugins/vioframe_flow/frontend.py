@@ -82,9 +82,7 @@ class FlowFrontend(Frontend):
             )
         self._camera = rig.cameras[0]
         self._before = None
-        if self._cache_folder is not None:
-            kept = f"levels of {self._bound_px!r} px" if self._quantise else "pixels"
-            self._cache = FlowCache(self._cache_folder, f"{self.settings()} {kept}")
+        self._cache = self._open_cache()
 
     def counters(self) -> Mapping[str, int]:
         """What the cache had and what it lacked."""
@@ -120,8 +118,29 @@ class FlowFrontend(Frontend):
         for frame, flow in zip(frames, flows, strict=True):
             yield VisualFeatures(frame=frame, flow=flow)
 
+    def flow_batch(self, images: np.ndarray) -> np.ndarray:
+        """Flow (B, S, H, W, 2) float32 px of the pairs in windows of consecutive images, from the cache if it is there.
+
+        Args:
+            images: (B, S + 1, H, W) or (B, S + 1, H, W, 3) RGB, uint8.
+
+        Raises:
+            DataError: the cache has no space.
+        """
+        self._cache = self._open_cache()
+        return np.stack([self._flows([self._resize(to_gray(image)) for image in window]) for window in images])
+
+    def _open_cache(self) -> FlowCache | None:
+        """The cache for what :meth:`settings` says now; None where there is none."""
+        if self._cache_folder is None:
+            return None
+        kept = f"levels of {self._bound_px!r} px" if self._quantise else "pixels"
+        return FlowCache(self._cache_folder, f"{self.settings()} {kept}")
+
     def _prepare(self, frame: Frame, camera: Camera) -> Image:
-        gray = gray_image(frame, 0, camera, self._name)
+        return self._resize(gray_image(frame, 0, camera, self._name))
+
+    def _resize(self, gray: Image) -> Image:
         if self._size is None or gray.shape[::-1] == self._size:
             return gray
         # Averages areas where the image shrinks, which leaves nothing to alias.
@@ -157,6 +176,12 @@ class FlowFrontend(Frontend):
     @abstractmethod
     def settings(self) -> str:
         """All that :meth:`solve` depends on beside the images, as text."""
+
+
+def to_gray(image: Image) -> Image:
+    """(H, W) of (H, W) or (H, W, 3) RGB."""
+    gray: Image = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    return gray
 
 
 def require(option: str, value: object, good: bool, rule: str) -> None:

@@ -70,6 +70,7 @@ class TvnetFrontend(FlowFrontend):
         learn_constants: training may change τ, λ and θ, too.
         start_grid: (rows, columns) of a learned flow to start from, stretched over any image; None starts from zero.
         own_loss: train by the energy of TV-L1; False trains only through the parts after it.
+        weights: file of trained weights, in MLflow too, or None for those of classical TV-L1.
         device: ``cpu``, ``cuda``, or ``auto`` for the latter where there is one.
         batch: most pairs solved at once by :meth:`process_many`.
         quantise: round flow to 256 levels.
@@ -98,6 +99,7 @@ class TvnetFrontend(FlowFrontend):
         learn_constants: bool = False,
         start_grid: Sequence[int] | None = None,
         own_loss: bool = True,
+        weights: str | None = None,
         device: str = "auto",
         batch: int = 4,
         quantise: bool = True,
@@ -121,14 +123,31 @@ class TvnetFrontend(FlowFrontend):
         require("device", device, device in _DEVICES, f"one of {', '.join(_DEVICES)}")
         require_torch("frontend=tvnet")
         self._own_loss = own_loss
+        self._weights = weights
         self._device_option = device
 
     @cached_property
     def net(self) -> "TvNet":
-        """The network; made when first asked for, since torch takes seconds to import."""
+        """The network; made when first asked for, since torch takes seconds to import.
+
+        Raises:
+            ConfigError: there is no such file of weights.
+            DataError: the file is of another architecture, or damaged.
+        """
         from vioframe_flow.net import TvNet
 
-        return TvNet(**asdict(self._options)).eval()
+        net = TvNet(**asdict(self._options)).eval()
+        if self._weights is not None:
+            from vioframe.learning.weights import load_weights, locate_weights
+
+            # The file is held against a part, which this one is as soon as it has its net.
+            self.__dict__["net"] = net
+            try:
+                load_weights(locate_weights(self._weights, "frontend.weights"), self, "frontend.weights")
+            except BaseException:
+                del self.__dict__["net"]
+                raise
+        return net
 
     @property
     def architecture(self) -> Mapping[str, str | int | float | bool]:
@@ -173,7 +192,7 @@ class TvnetFrontend(FlowFrontend):
         return f"tvnet {asdict(self._options)} weights {digest.hexdigest()}"
 
     def forward_batch(self, batch: "WindowBatch", upstream: "Mapping[str, Tensor]") -> "dict[str, Tensor]":
-        """Flow of every pair of a batch.
+        """Flow of every pair of a batch; from the cache, if there is one and nothing of the net is being trained.
 
         Args:
             batch: with images in [0, 1], best of ``size_px`` already: others are brought to it, nearly as streaming
@@ -183,6 +202,10 @@ class TvnetFrontend(FlowFrontend):
         Returns:
             ``"flow"``: (B, S, 2, H, W) px, on 256 levels if quantised, through which gradients pass unchanged.
         """
+        if self._cache_folder is not None and not any(each.requires_grad for each in self.net.parameters()):
+            from vioframe_flow.batches import flow_of_batch
+
+            return {FLOW: flow_of_batch(self, batch)}
         from vioframe_flow.net import split_pairs
 
         flow = self.net(*split_pairs(batch.images, self._size))

@@ -1,15 +1,18 @@
 """TVNet as a part that can be trained: what it gives in batches is what it gives in streaming."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="torch is not installed (pip install 'vioframe[learn]')")
 pytest.importorskip("safetensors", reason="safetensors is not installed (pip install 'vioframe[learn]')")
 
-from vioframe.errors import ConfigError  # noqa: E402
+from vioframe.errors import ConfigError, DataError  # noqa: E402
 from vioframe.interfaces import Trainable  # noqa: E402
 from vioframe.learning.batch import RigBatch, WindowBatch  # noqa: E402
-from vioframe_flow import TvnetFrontend  # noqa: E402
+from vioframe.learning.weights import save_weights  # noqa: E402
+from vioframe_flow import DisFrontend, TvnetFrontend  # noqa: E402
 
 
 def tvnet(**options) -> TvnetFrontend:
@@ -115,6 +118,57 @@ def test_the_cache_knows_the_weights(tmp_path, rig_of, sliding) -> None:
         part.setup(rig_of(64, 48))
         part.process_many(frames)
         assert part.counters()["flows computed"] == computed
+
+
+def test_a_frozen_net_is_served_from_the_cache(tmp_path, rig_of, sliding, monkeypatch) -> None:
+    frames = sliding(64, 48)
+    part = tvnet(cache=str(tmp_path))
+    part.setup(rig_of(64, 48))
+    streamed = np.stack([features.flow for features in part.process_many(frames)][1:])
+    part.net.requires_grad_(False)
+    monkeypatch.setattr(TvnetFrontend, "solve", lambda *_: pytest.fail("computed again"))
+    flow = part.forward_batch(batch_of(frames), {})["flow"]
+    np.testing.assert_array_equal(flow[0].permute(0, 2, 3, 1).numpy(), streamed)
+    # One that is being trained computes, and so has a gradient.
+    part.net.requires_grad_(True)
+    assert part.forward_batch(batch_of(frames), {})["flow"].requires_grad
+
+
+@pytest.mark.parametrize("colour", [1, 3])
+def test_dis_takes_part_in_training_as_it_streams(colour: int, tmp_path, rig_of, sliding) -> None:
+    windows = [sliding(64, 48), sliding(64, 48, seed=1)]
+    part = DisFrontend(cache=str(tmp_path), size_px=[48, 40])
+    assert isinstance(part, Trainable)
+    batch = batch_of(*windows)
+    coloured = dataclasses.replace(batch, images=batch.images.expand(-1, -1, colour, -1, -1))
+    for _ in range(2):
+        flow = part.forward_batch(coloured, {})["flow"]
+        assert flow.shape == (2, 4, 2, 40, 48)
+        for index, window in enumerate(windows):
+            part.setup(rig_of(64, 48))
+            streamed = np.stack([features.flow for features in part.process_many(window)][1:])
+            np.testing.assert_array_equal(flow[index].permute(0, 2, 3, 1).numpy(), streamed)
+    assert part.loss({"flow": flow}, batch) == {}
+    assert list(part.net.parameters()) == []
+
+
+def test_weights_come_back(tmp_path, sliding) -> None:
+    trained = tvnet(start_grid=[2, 3], learn_constants=True)
+    with torch.no_grad():
+        for parameter in trained.net.parameters():
+            parameter += 0.01 * torch.randn_like(parameter)
+    save_weights(tmp_path / "flow.safetensors", trained, {})
+    again = tvnet(start_grid=[2, 3], weights=str(tmp_path / "flow.safetensors"))
+    batch = batch_of(sliding(64, 48))
+    with torch.no_grad():
+        torch.testing.assert_close(again.forward_batch(batch, {}), trained.forward_batch(batch, {}))
+    with pytest.raises(DataError, match=r"frontend\.weights=.*another architecture.*iterations=3 where 4 is needed"):
+        _ = tvnet(start_grid=[2, 3], iterations=4, weights=str(tmp_path / "flow.safetensors")).net
+    with pytest.raises(ConfigError, match=r"frontend\.weights=.*no such file"):
+        _ = tvnet(weights=str(tmp_path / "nothing.safetensors")).net
+    (tmp_path / "cut.safetensors").write_bytes((tmp_path / "flow.safetensors").read_bytes()[:-100])
+    with pytest.raises(DataError, match="not a whole safetensors file"):
+        _ = tvnet(start_grid=[2, 3], weights=str(tmp_path / "cut.safetensors")).net
 
 
 def test_a_gpu_that_is_not_there_is_missed_in_setup(rig_of, monkeypatch) -> None:
