@@ -1,5 +1,6 @@
 """``task=train`` from the command line, with a part that a stranger brings."""
 
+import csv
 import json
 import subprocess
 import sys
@@ -18,14 +19,16 @@ SMALL = [
     "progress=false",
     "training_data.train.seed=[0]",
     "training_data.validation.seed=[0]",
-    "training_data.train.duration_s=8",
-    "training_data.validation.duration_s=8",
+    "training_data.train.duration_s=6",
+    "training_data.validation.duration_s=6",
+    "training_data.train.camera.rate_hz=10",
+    "training_data.validation.camera.rate_hz=10",
     "training_data.train.sequence=walk",
     "training_data.validation.sequence=walk",
 ]
 
 
-def test_a_strangers_part_is_trained_resumed_and_used(install, cli, tmp_path):
+def test_a_strangers_part_is_trained_by_one_process_or_two_resumed_and_used(install, cli, tmp_path):
     sites = (install("tiny"),)
     small = [*SMALL, f"trainer.cache={tmp_path}/cache"]
     done = cli(*small, "hydra.run.dir=one", sites=sites)
@@ -37,6 +40,17 @@ def test_a_strangers_part_is_trained_resumed_and_used(install, cli, tmp_path):
     assert [each["name"] for each in card["data"]["training"]] == ["walk-20000"]
     assert [each["name"] for each in card["data"]["validation"]] == ["walk-10000"]
     assert len(list((tmp_path / "cache" / "recordings").iterdir())) == 2
+
+    # Two processes take half a batch each: together the same steps, so the same curve.
+    shared = cli(*small, "hydra.run.dir=both", "trainer.devices=2", "trainer.batch_size=2", sites=sites)
+    assert shared.returncode == 0, shared.stderr
+    one, two = (
+        list(csv.DictReader((tmp_path / name / "curve.csv").read_text().splitlines())) for name in ("one", "both")
+    )
+    for alone, together in zip(one, two, strict=True):
+        assert set(alone) == set(together)
+        for name in set(alone) - {"images_per_s"}:
+            assert float(together[name]) == pytest.approx(float(alone[name]), rel=1e-3), name
 
     resumed = cli(*small, "hydra.run.dir=two", "trainer.resume=one/resume.ckpt", "trainer.max_epochs=3", sites=sites)
     assert resumed.returncode == 0, resumed.stderr

@@ -16,7 +16,8 @@ import torch
 from learned_parts import TinyVo, options
 from learned_scenes import stored
 from vioframe.errors import ConfigError, DataError
-from vioframe.learning.training import Split, seed_everything, train_parts
+from vioframe.learning.seeding import seed_everything
+from vioframe.learning.training import Split, train_parts
 from vioframe.learning.weights import load_weights
 from vioframe.tracking import NullTracker
 

@@ -95,7 +95,8 @@ class Curve(Callback):
         """Write the row."""
         elapsed_s = time.perf_counter() - self._began - self._validation_s
         row: Row = {"epoch": float(trainer.current_epoch), "step": float(trainer.global_step)}
-        row |= {name: float(total) / count for name, (total, count) in self._sums.items()}
+        for name, (total, count) in self._sums.items():
+            row[name] = float(trainer.strategy.reduce(total / count, reduce_op="mean"))
         row["learning_rate"] = float(trainer.optimizers[0].param_groups[0]["lr"])
         row["images_per_s"] = self._images / max(elapsed_s, 1e-9)
         score = pl_module.score if isinstance(pl_module, TrainingModule) else None

@@ -29,6 +29,7 @@ from vioframe.learning.datamodule import WindowData
 from vioframe.learning.module import TrainingModule
 from vioframe.learning.options import TrainerOptions
 from vioframe.learning.scoring import Score, mean_motion, score_motions
+from vioframe.learning.seeding import seed_everything
 from vioframe.learning.weights import load_weights, read_card
 from vioframe.tracking import Tracker
 
@@ -133,11 +134,6 @@ def train_parts(
     return _result(best, curve, trained, constant)
 
 
-def seed_everything(seed: int) -> None:
-    """Seed numpy, Python and torch, on every device."""
-    lightning.seed_everything(seed, workers=True, verbose=False)
-
-
 def _constant_score(training: Split, validation: Split, options: TrainerOptions) -> Score:
     motion = mean_motion(training.sequences)
     return score_motions(
@@ -160,7 +156,8 @@ def _trainer(options: TrainerOptions, folder: Path, callbacks: list[Callback]) -
         return lightning.Trainer(
             accelerator=options.accelerator,
             devices=options.devices,
-            strategy="ddp" if options.devices > 1 else "auto",
+            # A part may leave some of its weights out of its answer, such as an auxiliary head.
+            strategy="ddp_find_unused_parameters_true" if options.devices > 1 else "auto",
             precision=precision,
             max_epochs=options.max_epochs,
             max_time=None if options.max_minutes is None else timedelta(minutes=options.max_minutes),

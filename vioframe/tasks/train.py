@@ -1,6 +1,7 @@
 """``task=train``: train the parts that have a net, together, and keep the weights that do best in validation."""
 
 import logging
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +19,7 @@ from vioframe.interfaces import Trainable
 from vioframe.learning import require_torch
 from vioframe.tasks.interruption import INTERRUPTED, terminate_like_interrupt
 from vioframe.tasks.progress import frame_progress
-from vioframe.tracking import Tracker
+from vioframe.tracking import NullTracker, Tracker
 
 if TYPE_CHECKING:
     from vioframe.learning.options import TrainerOptions
@@ -33,19 +34,24 @@ def run(config: DictConfig) -> int:
     """Train what ``config`` describes; return the exit status, 130 after Ctrl-C."""
     require_torch("task=train", training=True)
     from vioframe.learning.options import TrainerOptions
-    from vioframe.learning.training import seed_everything, train_parts
+    from vioframe.learning.seeding import seed_everything
 
     hydra_config = HydraConfig.get()
     choices = {group: str(option) for group, option in hydra_config.runtime.choices.items()}
-    shown = bool(config.progress) and hydra_config.mode != RunMode.MULTIRUN
+    # With trainer.devices=2 lightning starts this command again for each further process; one speaks for all.
+    follows = int(os.environ.get("LOCAL_RANK", "0")) > 0
+    shown = bool(config.progress) and hydra_config.mode != RunMode.MULTIRUN and not follows
     options = build(config, "trainer", TrainerOptions, choices.get("trainer", ""))
     # Before the parts are built: their first weights are drawn then.
     seed_everything(options.seed)
     parts = trainable_parts(config, choices)
+    # Lightning takes its seconds only now that the user's mistakes are told.
+    from vioframe.learning.training import train_parts
+
     # A run that goes on goes on where it was: its weights and its curve are there.
     output = Path(hydra_config.runtime.output_dir)
     folder = output if options.resume is None else Path(options.resume).expanduser().parent
-    tracker = build(config, "tracker", Tracker, choices.get("tracker", ""))
+    tracker = NullTracker() if follows else build(config, "tracker", Tracker, choices.get("tracker", ""))
     plain = OmegaConf.to_container(config, resolve=True)
     parameters = {str(key): value for key, value in plain.items()} if isinstance(plain, dict) else {}
     about = {"parts": {slot: choices.get(slot, "none") for slot in parts}, "config": _part_configs(parameters, parts)}
@@ -63,6 +69,8 @@ def run(config: DictConfig) -> int:
             log.warning("interrupted; go on with trainer.resume=%s", folder / "resume.ckpt")
             tracker.finish("killed", "interrupted by the user")
             return INTERRUPTED
+        if follows:
+            return 0
         _tell(trained, folder)
         for path in (*trained.weights.values(), *(path.with_suffix(".json") for path in trained.weights.values())):
             tracker.log_file(path, "weights")
