@@ -8,6 +8,5 @@
 ``deepvo``         FlowNetS features and two LSTM layers
 ``motion``         vectors of six to rigid motions and back, composition
 ``losses``         squared errors and how rotation and translation are weighed
-``counting``       parameters, multiply-accumulates, bytes, milliseconds
 =================  ====================================================================
 """

@@ -12,8 +12,8 @@ pytest.importorskip("torch", reason="needs torch: pip install 'vioframe[learn]'"
 import torch
 
 from vioframe.errors import ConfigError, DataError
+from vioframe.learning.counting import size_of
 from vioframe_tsvo.net.backbones import BACKBONES, load_imagenet, make_backbone, widen
-from vioframe_tsvo.net.counting import size_of
 
 # torchvision's documentation of its IMAGENET1K weights: parameters, 1e9 multiply-accumulates, size of the crop.
 # Inception's file has 27 161 264 with the auxiliary classifier's 3 326 696, which GoogLeNet's figure leaves out.

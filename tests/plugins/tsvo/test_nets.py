@@ -5,14 +5,13 @@ import pytest
 pytest.importorskip("torch", reason="needs torch: pip install 'vioframe[learn]'")
 
 import torch
-from torch import nn
 
 from vioframe.errors import ConfigError, ShapeError
+from vioframe.learning.counting import size_of
 from vioframe_tsvo.net.backbones import BACKBONES
-from vioframe_tsvo.net.counting import milliseconds, size_of
 from vioframe_tsvo.net.deepvo import DeepVoNet
 from vioframe_tsvo.net.losses import FixedWeights, GaussianLikelihood, LearnedWeights
-from vioframe_tsvo.net.spatial import LAYERS, FlowNetConvolutions, SpatialStream
+from vioframe_tsvo.net.spatial import FlowNetConvolutions, SpatialStream
 from vioframe_tsvo.net.two_stream import TwoStreamNet, pairs_of, stack_flows
 
 
@@ -77,19 +76,6 @@ def test_lstm_count_is_its_equations():
     weights = 4000 * (features + 1000) + 4000 * 2000 + 4 * 4000
     assert size.parameters - convolutions.parameters == weights + 1000 * 6 + 6
     assert convolutions.parameters == 24_050_752 - (9 * 1024 * 1024 + 1024)
-
-
-def test_a_layer_that_cannot_be_counted_is_refused():
-    with pytest.raises(ConfigError, match="Conv3d are not known"):
-        size_of(nn.Conv3d(1, 1, 3), torch.zeros(1, 1, 3, 3, 3))
-    with pytest.raises(ConfigError, match="LSTM are not known"):
-        size_of(nn.LSTM(3, 4, bidirectional=True), torch.zeros(2, 1, 3))
-
-
-def test_time_is_measured():
-    net = FlowNetConvolutions(layers=LAYERS[:3], width=0.1).eval()
-    images = torch.zeros(1, 6, 32, 32)
-    assert 0 < milliseconds(lambda: net(images), repeats=3) < 1000
 
 
 def test_flows_are_stacked_oldest_first():
