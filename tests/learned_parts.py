@@ -86,7 +86,8 @@ class TinyVo(VOEstimator):
         return {"part": "tiny", "width": self._width, "context": self._context}
 
     def forward_batch(self, batch, upstream):
-        grey = batch.images.mean(dim=2)
+        # The scene is bright dots on grey of 60.
+        grey = 4.0 * (batch.images.mean(dim=2) - 60 / 255)
         stacks = [
             torch.cat([grey[:, k : k + self._context], grey[:, k + 1 : k + 1 + self._context]], dim=1)
             for k in range(batch.pairs - self._context + 1)

@@ -78,6 +78,13 @@ def test_ranking_is_relative_to_constant_motion():
     assert Score(t_rel_percent=10.0, r_rel_deg_per_100m=5.0, segments=3).relative_to(constant) == 0.75
 
 
+def test_on_a_straight_road_a_small_rotation_does_not_decide():
+    constant = Score(t_rel_percent=20.0, r_rel_deg_per_100m=0.0, segments=3)
+    good = Score(t_rel_percent=2.0, r_rel_deg_per_100m=0.1, segments=3)
+    bad = Score(t_rel_percent=19.0, r_rel_deg_per_100m=0.0, segments=3)
+    assert good.relative_to(constant) < bad.relative_to(constant)
+
+
 def test_no_segment_is_told():
     sequence = straight(1.0)
     with pytest.raises(DataError, match=r"too short to be scored .*59.0 m"):

@@ -235,6 +235,45 @@ class BestWeights(Callback):
         self.best = kept
 
 
+class BestPicture(Callback):
+    """Draws the trajectories of a validation that is the best so far; in the folder and the tracker.
+
+    Args:
+        folder: of ``validation.png``.
+        tracker: of the run.
+    """
+
+    def __init__(self, folder: Path, tracker: Tracker) -> None:
+        self._path = folder / "validation.png"
+        self._tracker = tracker
+        self._least = math.inf
+
+    def state_dict(self) -> dict[str, Any]:
+        """The best so far."""
+        return {"least": self._least}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Draw only what is better than before."""
+        self._least = float(state_dict["least"])
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Draw, if it is worth it."""
+        if not isinstance(pl_module, TrainingModule) or pl_module.score is None or pl_module.rank_value >= self._least:
+            return
+        self._least = pl_module.rank_value
+        if not trainer.is_global_zero:
+            return
+        from vioframe.learning.pictures import draw_trajectories
+
+        score = pl_module.score
+        caption = (
+            f"epoch {trainer.current_epoch} · camera 0 seen from above, no alignment · "
+            f"t_rel {score.t_rel_percent:.2f} % · r_rel {score.r_rel_deg_per_100m:.2f} °/100 m"
+        )
+        draw_trajectories(self._path, pl_module.trajectories(), caption)
+        self._tracker.log_file(self._path, "plots")
+
+
 class ResumePoint(Callback):
     """Writes ``resume.ckpt`` at the end of every epoch; last of the callbacks, so that it holds their states."""
 

@@ -64,6 +64,8 @@ class TrainingModule(lightning.LightningModule):
         self._answered: list[np.ndarray] = []
         for slot, net in self.nets.items():
             net.requires_grad_(slot in chosen)
+        if not any(parameter.requires_grad for parameter in self.nets.parameters()):
+            raise ConfigError(f"trainer.train={chosen}: these parts have no weights to train; choose one that has")
 
     def run_parts(self, batch: WindowBatch) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """What all parts return, by name, and their losses as ``slot/name``, with the sum as ``loss``.

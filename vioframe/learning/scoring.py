@@ -19,6 +19,11 @@ from vioframe.evaluation.align import MatchedPoses
 from vioframe.evaluation.metrics import segment_errors
 from vioframe.geometry import se3, so3
 
+# On a straight road constant motion has next to no rotation error, and nothing should be measured in units of nothing.
+# These are about what the better learned odometers reach on KITTI.
+_LEAST_PERCENT = 1.0
+_LEAST_DEG_PER_100M = 1.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Score:
@@ -36,9 +41,8 @@ class Score:
 
     def relative_to(self, other: "Score") -> float:
         """Mean of both errors in units of another's; less is better."""
-        # On a straight road constant motion may have no rotation error; a hundredth of a degree is none.
-        t_rel = self.t_rel_percent / max(other.t_rel_percent, 1e-2)
-        r_rel = self.r_rel_deg_per_100m / max(other.r_rel_deg_per_100m, 1e-2)
+        t_rel = self.t_rel_percent / max(other.t_rel_percent, _LEAST_PERCENT)
+        r_rel = self.r_rel_deg_per_100m / max(other.r_rel_deg_per_100m, _LEAST_DEG_PER_100M)
         return 0.5 * (t_rel + r_rel)
 
 

@@ -24,7 +24,7 @@ from vioframe import __version__
 from vioframe.data.windows import StoredSequence, WindowIndex
 from vioframe.errors import DataError
 from vioframe.interfaces import Trainable
-from vioframe.learning.callbacks import Bar, BestWeights, Curve, ResumePoint, Row, StopDivergence
+from vioframe.learning.callbacks import Bar, BestPicture, BestWeights, Curve, ResumePoint, Row, StopDivergence
 from vioframe.learning.datamodule import WindowData
 from vioframe.learning.module import TrainingModule
 from vioframe.learning.options import TrainerOptions
@@ -122,12 +122,14 @@ def train_parts(
         workers=options.workers,
     )
     base = _card(training, validation, options, about, constant)
-    trained = {slot: part for slot, part in parts.items() if options.train is None or slot in options.train}
+    # A part without weights, such as a classical flow, only takes part.
+    trained = {slot: part for slot, part in parts.items() if any(p.requires_grad for p in part.net.parameters())}
     best = BestWeights(folder / "weights", trained, options.top_k, lambda module: {**base, **_figures(module, options)})
     curve = Curve(folder, tracker)
     # The bar comes first, to be gone when another raises; the curve before what is saved; the resume point last.
     watchers: list[Callback] = [Bar()] if shown else []
-    watchers += [StopDivergence(options.divergence_factor, options.learning_rate), best, curve, ResumePoint(folder)]
+    watchers += [StopDivergence(options.divergence_factor, options.learning_rate), best, BestPicture(folder, tracker)]
+    watchers += [curve, ResumePoint(folder)]
     folder.mkdir(parents=True, exist_ok=True)
     trainer = _trainer(options, folder, watchers)
     _fit(trainer, module, data, options)

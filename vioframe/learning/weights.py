@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from vioframe.errors import ConfigError, DataError
 from vioframe.interfaces import Trainable
@@ -28,7 +28,8 @@ def save_weights(path: Path, part: Trainable, card: Mapping[str, object]) -> Non
     header = {"format": FORMAT, "architecture": json.dumps(dict(part.architecture), sort_keys=True)}
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
-    save_file(state, partial, metadata=header)
+    # Written as bytes, so that others may read it as the umask says: the library's own file is its owner's alone.
+    partial.write_bytes(save(state, metadata=header))
     os.replace(partial, path)
     document = {
         "format": FORMAT,
