@@ -34,6 +34,7 @@ class DeepVo(LearnedVO):
         rotation_unit_rad, translation_unit_m: what an output of 1 means.
         loss: ``fixed``, ``learned`` or ``likelihood``, with which it states a covariance.
         rotation_weight: of ``fixed``, m²/rad².
+        log_variance_rotation, log_variance_translation: from which ``learned`` starts, ln rad² and ln m².
         weights: file of trained weights, in MLflow too, or None.
         device: ``cpu``, ``cuda`` or ``auto``.
 
@@ -59,6 +60,8 @@ class DeepVo(LearnedVO):
         translation_unit_m: float = 1.0,
         loss: str = "fixed",
         rotation_weight: float = 100.0,
+        log_variance_rotation: float = -3.0,
+        log_variance_translation: float = 0.0,
         weights: str | None = None,
         device: str = "auto",
     ) -> None:
@@ -70,6 +73,8 @@ class DeepVo(LearnedVO):
             translation_unit_m=translation_unit_m,
             loss=loss,
             rotation_weight=rotation_weight,
+            log_variance_rotation=log_variance_rotation,
+            log_variance_translation=log_variance_translation,
             weights=weights,
             device=device,
         )

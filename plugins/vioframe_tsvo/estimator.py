@@ -1,5 +1,6 @@
 """What learned estimators have in common: weights, device, images, losses, and numbers into motions."""
 
+import logging
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from vioframe_tsvo.net.motion import Rotation
     from vioframe_tsvo.net.two_stream import MotionEstimate
 
+log = logging.getLogger(__name__)
+
 _CHOICES = {
     "rotation": ("log", "euler"),
     "loss": ("learned", "fixed", "likelihood"),
@@ -43,6 +46,7 @@ class MotionOptions:
         rotation_unit_rad, translation_unit_m: what an output of 1 means.
         loss: ``learned`` weights, ``fixed`` ones, or the ``likelihood`` of a Gaussian with the variances stated.
         rotation_weight: of the fixed ones, m²/rad².
+        log_variance_rotation, log_variance_translation: from which the learned ones start, ln rad² and ln m².
         weights: file of trained weights, in MLflow too, or None.
         device: ``cpu``, ``cuda``, or ``auto`` for the latter where there is one.
 
@@ -57,6 +61,8 @@ class MotionOptions:
     translation_unit_m: float
     loss: str
     rotation_weight: float
+    log_variance_rotation: float
+    log_variance_translation: float
     weights: str | None
     device: str
 
@@ -115,6 +121,8 @@ class LearnedVO(VOEstimator):
         self._options = options
         self._seen: tuple[Frame, Tensor] | None = None
         self._ready = False
+        # Whether there is a reason to believe its answers: weights, or a training in this process.
+        self._taught = options.weights is not None
 
     @cached_property
     def net(self) -> "nn.Module":
@@ -130,7 +138,10 @@ class LearnedVO(VOEstimator):
 
         weighing: nn.Module
         if self._options.loss == "learned":
-            weighing = LearnedWeights()
+            weighing = LearnedWeights(
+                log_variance_rotation=self._options.log_variance_rotation,
+                log_variance_translation=self._options.log_variance_translation,
+            )
         elif self._options.loss == "fixed":
             weighing = FixedWeights(rotation_weight=self._options.rotation_weight)
         else:
@@ -176,6 +187,13 @@ class LearnedVO(VOEstimator):
         if not rig.cameras:
             raise DataError(f"vo={self._name} needs a camera, but the recording's calibration has none")
         self.net.to(self._device()).eval()
+        if not self._taught:
+            log.warning(
+                "vo=%s has no weights, so its motions are those of a random net: give vo.weights=FILE (task=train "
+                "makes one)",
+                self._name,
+            )
+            self._taught = True  # once is enough
         self._seen = None
         self._ready = True
 
@@ -193,6 +211,7 @@ class LearnedVO(VOEstimator):
         """What :meth:`forward_batch` returns: vectors in rad and metres, and the last ``answered`` as motions."""
         from vioframe_tsvo.net.motion import motion_from_vector
 
+        self._taught = True
         vector, log_variances = self._scaled(estimate)
         named = {"motion": vector, "T_prev_cur": motion_from_vector(vector[:, -answered:], self._options.rotation)}
         return named if log_variances is None else {**named, "log_variances": log_variances}

@@ -53,6 +53,7 @@ class Tsvo(LearnedVO):
         rotation_unit_rad, translation_unit_m: what an output of 1 means.
         loss: ``learned``, ``fixed`` or ``likelihood``, with which it states a covariance.
         rotation_weight: of ``fixed``, m²/rad².
+        log_variance_rotation, log_variance_translation: from which ``learned`` starts, ln rad² and ln m².
         weights: file of trained weights, in MLflow too, or None.
         device: ``cpu``, ``cuda`` or ``auto``.
 
@@ -80,6 +81,8 @@ class Tsvo(LearnedVO):
         translation_unit_m: float = 1.0,
         loss: str = "learned",
         rotation_weight: float = 100.0,
+        log_variance_rotation: float = -3.0,
+        log_variance_translation: float = 0.0,
         weights: str | None = None,
         device: str = "auto",
     ) -> None:
@@ -91,6 +94,8 @@ class Tsvo(LearnedVO):
             translation_unit_m=translation_unit_m,
             loss=loss,
             rotation_weight=rotation_weight,
+            log_variance_rotation=log_variance_rotation,
+            log_variance_translation=log_variance_translation,
             weights=weights,
             device=device,
         )

@@ -11,7 +11,7 @@ pytest.importorskip("safetensors", reason="needs safetensors: pip install 'viofr
 
 import torch
 
-from composing import composed
+from composing import composed, offered
 from learned_scenes import stored
 from vioframe.build import build
 from vioframe.data.windows import cut_window
@@ -207,6 +207,18 @@ def test_numbers_that_are_not_finite_are_no_motion(make, scene):
 
 
 @MAKERS
+def test_a_random_net_is_told_of_once_and_a_trained_one_never(make, scene, batch, caplog):
+    part, trained = make(), make()
+    for _ in range(2):
+        part.setup(scene.rig)
+    assert caplog.text.count("has no weights") == 1
+    caplog.clear()
+    trained.forward_batch(*batch)
+    trained.setup(scene.rig)
+    assert not caplog.text
+
+
+@MAKERS
 def test_weights_survive_the_disk(make, scene, tmp_path):
     part = enliven(make())
     part.setup(scene.rig)
@@ -311,6 +323,12 @@ def test_one_word_chooses_the_backbone(backbone):
     assert "tvnet" in str(config.frontend._target_).lower()
     part = build(config, "vo", VOEstimator, "tsvo")
     assert (part.architecture["backbone"], part.architecture["stack"]) == (backbone, 5)
+
+
+@pytest.mark.parametrize("backbone", offered("backbone"))
+def test_every_field_of_a_backbone_is_in_its_yaml(backbone):
+    fields = {each.name for each in dataclasses.fields(Backbone)}
+    assert set(composed("vo=tsvo", f"backbone={backbone}").backbone) == fields | {"_target_"}
 
 
 def test_what_the_user_writes_wins():
