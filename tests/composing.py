@@ -3,10 +3,14 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
+from vioframe.build import build
+from vioframe.errors import ConfigError
+from vioframe.pipeline import SLOTS
 from vioframe.plugins import core_conf, discover, extend_hydra
 
 
@@ -23,6 +27,16 @@ def composed(*overrides: str) -> DictConfig:
     """The config that these overrides of the command line give; outside a run, no tracker."""
     with composer():
         return compose("config", overrides=["tracker=none", *overrides])
+
+
+def built(slot: str, name: str, *overrides: str):
+    """The part that ``slot=name`` and further overrides build; skips the test where it needs torch and there is none."""
+    try:
+        return build(composed(f"{slot}={name}", *overrides), slot, SLOTS[slot], name)
+    except ConfigError as error:
+        if "vioframe[learn]" in str(error):
+            pytest.skip(str(error))
+        raise
 
 
 def offered(group: str) -> list[str]:

@@ -5,7 +5,7 @@ import inspect
 import pytest
 from omegaconf import OmegaConf
 
-from composing import composed, offered
+from composing import built, composed, offered
 from vioframe.build import build, build_pipeline, resolve_class
 from vioframe.data.recording import Dataset
 from vioframe.errors import ConfigError
@@ -29,8 +29,7 @@ def targets(node, key: str):
 
 @pytest.mark.parametrize(("slot", "name"), PARTS, ids=lambda value: str(value))
 def test_part_builds_from_its_yaml(slot, name):
-    config = composed(f"{slot}={name}")
-    build(config, slot, SLOTS[slot], name)
+    built(slot, name)
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,7 @@
 
 import pytest
 
-from composing import composed, offered
-from vioframe.build import build
+from composing import built, offered
 from vioframe.pipeline import SLOTS
 from vioframe.testing import check_component
 
@@ -17,4 +16,4 @@ PARTS = [(slot, name) for slot in SLOTS for name in offered(slot) if name != "no
 
 @pytest.mark.parametrize(("slot", "name"), PARTS, ids=lambda value: str(value))
 def test_component_keeps_its_contract(slot, name):
-    check_component(build(composed(f"{slot}={name}", *SMALLER.get(name, ())), slot, SLOTS[slot], name))
+    check_component(built(slot, name, *SMALLER.get(name, ())))
