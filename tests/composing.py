@@ -30,7 +30,7 @@ def composed(*overrides: str) -> DictConfig:
 
 
 def built(slot: str, name: str, *overrides: str):
-    """The part that ``slot=name`` and further overrides build; skips the test where it needs torch and there is none."""
+    """The part that ``slot=name`` and further overrides build; skips the test where there is no torch for it."""
     try:
         return build(composed(f"{slot}={name}", *overrides), slot, SLOTS[slot], name)
     except ConfigError as error:
