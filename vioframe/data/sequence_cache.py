@@ -81,7 +81,9 @@ class SequenceCache:
         target = self._folder / f"{_clean(recording.name)}-{self._key(recording, source)[:16]}"
         if not (target / "manifest.json").exists():
             self._write(recording, target, progress)
-        return _read(target)
+        sequence, content = _read(target)
+        progress(len(sequence))
+        return sequence, content
 
     def _key(self, recording: Recording, source: str) -> str:
         truth = recording.ground_truth()

@@ -107,7 +107,8 @@ class Curve(Callback):
         self.rows.append(row)
         if trainer.is_global_zero:
             write_rows(self._folder / CURVE_FILE, self.rows)
-            self._tracker.log_metrics(row, step=trainer.current_epoch)
+            series = {name: value for name, value in row.items() if name != "epoch"}
+            self._tracker.log_metrics(series, step=trainer.current_epoch)
 
     def _add(self, split: str, losses: Mapping[str, Tensor] | None) -> None:
         for name, value in (losses or {}).items():
