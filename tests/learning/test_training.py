@@ -13,7 +13,7 @@ pytest.importorskip("lightning", reason="needs the extra learn")
 
 import torch
 
-from learned_parts import TinyVo, options
+from learned_parts import TinyVo, motion_of, options
 from learned_scenes import stored
 from vioframe.errors import ConfigError, DataError
 from vioframe.learning.seeding import seed_everything
@@ -202,6 +202,24 @@ def test_a_slot_without_a_net_cannot_be_trained(tmp_path, train):
 def test_a_part_that_predicts_no_motion_cannot_be_validated(tmp_path):
     with pytest.raises(ConfigError, match="nothing to validate"):
         run(tmp_path, TinyVo(motion=False), max_epochs=1)
+
+
+def test_motions_of_half_a_precision_are_refused(tmp_path):
+    with pytest.raises(DataError, match=r"T_prev_cur comes as torch.bfloat16.*float32"):
+        run(tmp_path, max_epochs=1, precision="bf16")
+
+
+def test_mixed_precision_trains_where_motions_are_whole(tmp_path):
+    class Whole(TinyVo):
+        def forward_batch(self, batch, upstream):
+            self.net_dtype = self.net[0](torch.zeros(1, 2, 8, 8)).dtype
+            outputs = super().forward_batch(batch, upstream)
+            with torch.autocast("cpu", enabled=False):
+                return {"T_prev_cur": motion_of(outputs["tangent"].float()), "tangent": outputs["tangent"].float()}
+
+    part = Whole()
+    assert np.isfinite(run(tmp_path, part, max_epochs=1, precision="bf16").score.t_rel_percent)
+    assert part.net_dtype == torch.bfloat16
 
 
 def test_too_short_validation_is_told_before_the_first_step(tmp_path):

@@ -113,6 +113,11 @@ class TrainingModule(lightning.LightningModule):
         known, losses = self.run_parts(batch)
         if MOTION not in known:
             raise ConfigError(f"no part of {', '.join(self._parts)} predicts {MOTION}, so there is nothing to validate")
+        if known[MOTION].dtype not in (torch.float32, torch.float64):
+            raise DataError(
+                f"{MOTION} comes as {known[MOTION].dtype}, in which a trajectory cannot be chained: the part must "
+                "compute motions in float32 (output.float()) also where trainer.precision is lower"
+            )
         motions = known[MOTION].detach().to("cpu", torch.float64).numpy()
         if motions.ndim != 4 or motions.shape[1] > batch.pairs:
             raise DataError(

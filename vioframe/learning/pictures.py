@@ -28,7 +28,8 @@ def draw_trajectories(path: Path, trajectories: Sequence[tuple[StoredSequence, A
     columns = min(len(shown), 3)
     rows = -(-len(shown) // columns)
     with mpl.rc_context(STYLE):
-        figure = new_figure((4.2 * columns, 3.8 * rows))
+        # The caption needs six inches.
+        figure = new_figure((max(4.2 * columns, 6.4), 3.8 * rows))
         for number, (sequence, motions, answered) in enumerate(shown):
             axes = figure.add_subplot(rows, columns, number + 1)
             known = sequence.T_world_cam[sequence.known, :3, 3]
