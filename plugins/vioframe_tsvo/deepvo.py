@@ -32,7 +32,7 @@ class DeepVo(LearnedVO):
         batch_norm: after each convolution.
         rotation: what three numbers of rotation mean: ``log`` or ``euler``.
         rotation_unit_rad, translation_unit_m: what an output of 1 means.
-        loss: ``fixed``, ``learned`` or ``likelihood``, with which it states a covariance.
+        loss: ``learned``, ``fixed`` or ``likelihood``, with which it states a covariance.
         rotation_weight: of ``fixed``, m²/rad².
         log_variance_rotation, log_variance_translation: from which ``learned`` starts, ln rad² and ln m².
         weights: file of trained weights, in MLflow too, or None.
@@ -58,9 +58,9 @@ class DeepVo(LearnedVO):
         rotation: "Rotation" = "log",
         rotation_unit_rad: float = 0.05,
         translation_unit_m: float = 1.0,
-        loss: str = "fixed",
+        loss: str = "learned",
         rotation_weight: float = 100.0,
-        log_variance_rotation: float = -3.0,
+        log_variance_rotation: float = -8.0,
         log_variance_translation: float = 0.0,
         weights: str | None = None,
         device: str = "auto",

@@ -81,7 +81,7 @@ class Tsvo(LearnedVO):
         translation_unit_m: float = 1.0,
         loss: str = "learned",
         rotation_weight: float = 100.0,
-        log_variance_rotation: float = -3.0,
+        log_variance_rotation: float = -8.0,
         log_variance_translation: float = 0.0,
         weights: str | None = None,
         device: str = "auto",
