@@ -55,7 +55,8 @@ def run(config: DictConfig) -> int:
     for slot, interface in SLOTS.items():
         if config.get(slot):
             part = build(config, slot, interface, choices.get(slot, ""))
-            if isinstance(part, Trainable):
+            # Some take part in training with nothing to learn.
+            if isinstance(part, Trainable) and any(True for _ in part.net.parameters()):
                 cards.append(model_card(part, f"{slot}={choices.get(slot, '')}"))
     if not cards:
         told = ", ".join(f"{slot}={choices[slot]}" for slot in SLOTS if choices.get(slot))
