@@ -251,7 +251,7 @@ def consistency(options: Options) -> list[Entry]:
     """ANEES per degree of freedom over simulated walks with the real front end on drawn images."""
     entries = []
     for seed in range(options.runs):
-        with options.drawn(options.simulated("walk", seed, 20.0)) as view:
+        with options.drawn(options.simulated("walk", seed, 46.0)) as view:
             for fuser, rig, system in options.systems():
                 entries.append(entry(fuser, rig, f"walk-{seed}", seed, play(view(rig), system)))
                 tell(entries[-1], "ATE m", "ANEES pos", "ANEES ori", "completion %")

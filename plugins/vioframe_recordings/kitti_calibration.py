@@ -282,9 +282,7 @@ def spline_velocities(stamps_ns: Stamps, positions: Array, stiffness: float = _S
             _on_cubic(elapsed[-_OUTERMOST:], positions[-_OUTERMOST:], after),
         ]
     )
-    columns = [
-        make_smoothing_spline(times, places[:, axis], lam=stiffness).derivative()(elapsed) for axis in range(3)
-    ]
+    columns = [make_smoothing_spline(times, places[:, axis], lam=stiffness).derivative()(elapsed) for axis in range(3)]
     return np.stack(columns, axis=1)
 
 

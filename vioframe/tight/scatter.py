@@ -58,4 +58,5 @@ def _off_the_line(imu: ImuBlock) -> Array:
     values = np.concatenate([imu.gyro, imu.accel], axis=1)
     later = ((times[1:-1] - times[:-2]) / (times[2:] - times[:-2]))[:, None]
     distances = values[1:-1] - (1.0 - later) * values[:-2] - later * values[2:]
-    return np.square(distances) / (1.0 + (1.0 - later) ** 2 + later**2)
+    squares: Array = np.square(distances) / (1.0 + (1.0 - later) ** 2 + later**2)
+    return squares
