@@ -287,6 +287,6 @@ def spline_velocities(stamps_ns: Stamps, positions: Array, stiffness: float = _S
 
 
 def _on_cubic(times: Array, positions: Array, wanted: Array) -> Array:
-    """The cubic through positions (N, 3), at other times (M,)."""
+    """Positions (M, 3) at other times (M,), on the cubic that fits positions (N, 3), N ≥ 4, best."""
     place: Array = np.polynomial.polynomial.polyval(wanted, np.polynomial.polynomial.polyfit(times, positions, 3)).T
     return place

@@ -42,7 +42,7 @@ class SampleIntegrator:
     """Collects the samples since the last keyframe.
 
     Args:
-        noise: densities, of which the white ones hold until :meth:`push` says otherwise.
+        noise: densities, of which the bias walks are taken; the white ones come with every window.
         gravity: m/s².
         trust: how far holes between samples are believed.
     """
@@ -53,7 +53,6 @@ class SampleIntegrator:
         self._params.setIntegrationCovariance(_INTEGRATION_SIGMA**2 * np.eye(3))
         self._params.setBiasAccCovariance(max(noise.accel_walk, 1e-9) ** 2 * np.eye(3))
         self._params.setBiasOmegaCovariance(max(noise.gyro_walk, 1e-9) ** 2 * np.eye(3))
-        self._set_white_noise(noise.gyro_noise, noise.accel_noise)
         self.begin(ImuBias())
 
     def begin(self, bias: ImuBias) -> None:

@@ -19,7 +19,8 @@ class SampleScatter:
     at a hundred samples a second and more, next to nothing of the motion. A sensor that does not shake gives 1
     (EuRoC's on the ground: 0.7 to 1.0); on EuRoC's vehicle in flight the gyro gives 17 and the accelerometer 40.
     Vibration is not white, though, and adds far less to an increment than white noise of that scatter would: the
-    ratio says whether a sensor shakes, not by what factor its increments are worse.
+    ratio says whether a sensor shakes, not by what factor its increments are worse. A hole between samples reads as
+    vibration too: what follows it is trusted less for a second or so.
 
     Args:
         stated: noise densities of the rig, and its rate.
