@@ -61,6 +61,7 @@ class TinyVo(VOEstimator):
     """Two images in, translation and small rotation out; dropout on purpose, to see that resuming repeats it."""
 
     provides = frozenset({RELATIVE_POSE, METRIC_SCALE})
+    needs_training = False
 
     def __init__(self, width: int = 8, context: int = 1, dropout: float = 0.2, motion: bool = True) -> None:
         self._context = context

@@ -75,8 +75,15 @@ def metrics_of(document: Mapping[str, object]) -> dict[str, float]:
     Args:
         document: the parsed ``metrics.json``: ``{"sequences": [{"sequence": name, metric: number, ...}]}``.
             Nested mappings are joined with a dot; ``null``, text, booleans, non-finite numbers and what
-            stands below ``protocol`` are left out.
+            stands below ``protocol`` are left out. What nets weigh, ``{"model": {"gmac": number, ...}}`` beside the
+            sequences, is the same for all: ``model.gmac``.
     """
+    model = document.get("model")
+    numbers = _numbers({"model": model}) if isinstance(model, Mapping) else {}
+    return {clean_name(key): value for key, value in numbers.items()} | _sequence_metrics(document)
+
+
+def _sequence_metrics(document: Mapping[str, object]) -> dict[str, float]:
     entries = document.get("sequences")
     if not isinstance(entries, Sequence):
         return {}
