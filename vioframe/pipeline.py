@@ -118,7 +118,7 @@ class Pipeline:
                 initialises itself.
 
         Raises:
-            WiringError: a part needs images, and the rig has no camera.
+            WiringError: a part needs images or inertial samples, and the rig has none.
         """
         check_rig(self.parts(), rig, self.choices)
         for part in self.parts().values():
@@ -243,11 +243,18 @@ def check_wiring(parts: Mapping[str, Component], choices: Mapping[str, str]) -> 
 
 
 def check_rig(parts: Mapping[str, Component], rig: SensorRig, choices: Mapping[str, str]) -> None:
-    """Refuse a recording without the cameras that a part needs.
+    """Refuse a recording without the sensors that a part needs.
 
     Raises:
-        WiringError: names the part and the number of cameras it has and needs.
+        WiringError: names the part, and the number of cameras it has and needs.
     """
+    if not rig.has_imu and "integrator" in parts:
+        # Whatever fuses inertial samples gets them through an integrator.
+        name = choices.get("integrator", type(parts["integrator"]).__name__)
+        raise WiringError(
+            f"integrator={name} needs inertial samples, but the recording has none: use vision alone "
+            "(integrator=none fuser=vo_only, with a vo), or a recording that has them"
+        )
     available = len(rig.cameras) if rig.has_images else 0
     for slot, part in parts.items():
         needed = 2 if STEREO in part.requires else 1 if IMAGES in part.requires else 0

@@ -66,6 +66,11 @@ class ImuBlock:
         """Samples [start, end)."""
         return ImuBlock(stamps_ns=self.stamps_ns[start:end], gyro=self.gyro[start:end], accel=self.accel[start:end])
 
+    @staticmethod
+    def none() -> "ImuBlock":
+        """No samples at all."""
+        return ImuBlock(stamps_ns=np.zeros(0, dtype=np.int64), gyro=np.zeros((0, 3)), accel=np.zeros((0, 3)))
+
 
 Packet = Frame | ImuBlock
 """What a recording yields, in the order in which it arrives."""
@@ -160,6 +165,7 @@ class SensorRig:
         imu: noise densities.
         gravity: magnitude, m/s².
         camera_delay_ns: ``t_imu = t_cam + camera_delay_ns``.
+        has_imu: False where a recording has images alone: its frames are stamped by the camera's clock.
     """
 
     cameras: tuple[Camera, ...]
@@ -167,6 +173,7 @@ class SensorRig:
     gravity: float = 9.81
     camera_delay_ns: int = 0
     has_images: bool = True
+    has_imu: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -175,7 +182,7 @@ class SyncedWindow:
 
     Attributes:
         previous, current: frames on the IMU clock.
-        imu: with samples exactly at both stamps.
+        imu: with samples exactly at both stamps; empty where the rig has no inertial sensor.
         gap_ns: longest time without a measured sample inside the window.
         camera_delay_ns: what was added to the camera's stamp of ``current`` to bring it onto the IMU clock.
     """
@@ -187,6 +194,8 @@ class SyncedWindow:
     camera_delay_ns: int = 0
 
     def __post_init__(self) -> None:
+        if not len(self.imu):
+            return
         if self.imu.stamps_ns[0] != self.previous.stamp_ns or self.imu.stamps_ns[-1] != self.current.stamp_ns:
             raise ShapeError(
                 "SyncedWindow.imu must begin and end at the stamps of the frames, got "

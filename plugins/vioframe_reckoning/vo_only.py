@@ -32,8 +32,8 @@ class VoOnlyFuser(Fuser):
         on_invalid: over a window without a valid motion, go on with the last one (``constant_velocity``) or
             stay (``hold``). The status is ``lost`` there.
         level: begin with roll and pitch from the mean specific force of the first window, which errs by the
-            body's acceleration over gravity; otherwise with the body's axes as the world's. A given state
-            (``init=groundtruth``) comes before either.
+            body's acceleration over gravity; otherwise, and where there are no samples, with the body's axes as the
+            world's. A given state (``init=groundtruth``) comes before either.
         tilt_sigma: rad, of roll and pitch at a start without a given state.
         coast_rate_sigma: rad/s an axis, unknown rate over a window without a valid motion.
         coast_accel_sigma: m/s² an axis, unknown acceleration over such a window.
@@ -142,7 +142,8 @@ class VoOnlyFuser(Fuser):
             # Coasting before the first valid motion goes on as the given state moves.
             self._last_motion = se3.from_parts(np.eye(3), given.T_world_body[:3, :3].T @ given.v_world_body)
         else:
-            R_world_body = level(measurement.window.imu.accel.mean(axis=0)) if self._level else np.eye(3)
+            samples = measurement.window.imu
+            R_world_body = level(samples.accel.mean(axis=0)) if self._level and len(samples) else np.eye(3)
             self._T_world_body = se3.from_parts(R_world_body, np.zeros(3))
             covariance = initial_covariance(R_world_body, tilt_sigma=self._tilt_sigma)
         into_local = _local_from_state(self._T_world_body)

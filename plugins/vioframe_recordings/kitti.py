@@ -8,18 +8,19 @@ drives.
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from vioframe.checks import Array, Mask, Stamps
+from vioframe.checks import Mask, Stamps
 from vioframe.data import agreement, screening
 from vioframe.data.recording import Finding
 from vioframe.data.selection import FrameSelection, as_names, choose_frames
-from vioframe.errors import DataError
-from vioframe.geometry import se3, so3
+from vioframe.errors import ConfigError, DataError
+from vioframe.geometry import se3
 from vioframe.trajectory_io import read_times, read_trajectory
 from vioframe.types import Camera, ImuBlock, ImuNoise, Trajectory
-from vioframe_recordings.folders import FolderDataset, find_images, names_in
+from vioframe_recordings.folders import FolderDataset, find_images
 from vioframe_recordings.kitti_calibration import (
     NOMINAL_RATE_HZ,
     DriveDate,
@@ -29,8 +30,9 @@ from vioframe_recordings.kitti_calibration import (
     read_mat,
     rectified_camera,
     sample_rate_hz,
-    spline_velocities,
 )
+from vioframe_recordings.kitti_inventory import Inventory
+from vioframe_recordings.kitti_level import check_level, check_vehicle_up, level_by_vehicle, level_world
 from vioframe_recordings.stored import StoredRecording, check_first_images
 
 SAMPLES_PER_FRAME = 10
@@ -40,7 +42,11 @@ class KittiDataset(FolderDataset):
     """Odometry sequences; the options are those of ``conf/dataset/kitti.yaml``, with their meaning.
 
     The world has its origin where the vehicle is at frame 0, x along its heading there, and z up as the
-    accelerometer says (see :func:`level_world`).
+    accelerometer says (see :func:`level_world`), or the vehicle itself where there is none.
+
+    Raises:
+        ConfigError: an option outside its range.
+        DataError: sequences that were asked for are not there, all of which it names.
     """
 
     def __init__(
@@ -51,6 +57,8 @@ class KittiDataset(FolderDataset):
         images: bool = True,
         cameras: int = 1,
         color: bool = False,
+        imu: Literal["required", "none"] = "required",
+        stretch: Sequence[float] = (0.0, 1.0),
         every: int = 1,
         start_s: float = 0.0,
         duration_s: float | None = None,
@@ -61,16 +69,20 @@ class KittiDataset(FolderDataset):
         accel_noise: float = 2e-2,
         accel_walk: float = 1e-3,
     ) -> None:
+        if imu not in ("required", "none"):
+            raise ConfigError(f"dataset.imu must be required or none, got {imu!r}")
         super().__init__(
             key="kitti",
             root=root,
             images=images,
             cameras=cameras,
-            selection=FrameSelection(every=every, start_s=start_s, duration_s=duration_s),
-            camera_delay_s=camera_delay_s,
+            selection=FrameSelection(every=every, start_s=start_s, duration_s=duration_s, stretch=stretch),
+            # Where there are no samples, the camera's clock is the only one.
+            camera_delay_s=camera_delay_s if imu == "required" else 0.0,
             gravity=gravity,
         )
         self.color = color
+        self.has_imu = imu == "required"
         self.noise = ImuNoise(
             gyro_noise=gyro_noise,
             gyro_walk=gyro_walk,
@@ -79,12 +91,18 @@ class KittiDataset(FolderDataset):
             rate_hz=NOMINAL_RATE_HZ,
         )
         # YAML reads 04 as the number 4.
-        self._names = [name.zfill(2) for name in as_names(sequence)] or self._all_sequences()
+        asked = [name.zfill(2) for name in as_names(sequence)]
+        for name in asked:
+            _known_drive(name)
+        self._files = Inventory(root=self.root, images=images, cameras=self.camera_count, color=color, imu=self.has_imu)
+        self._files.check(asked)
+        self._names = asked or self._files.find()
 
     @property
     def sequences(self) -> Sequence[str]:
-        """Names of the sequences, two digits each."""
-        return self._names
+        """Names of the sequences, two digits each, with the stretch where there is one, such as ``06.90-100``."""
+        part = self.selection.part
+        return [f"{name}.{part}" for name in self._names] if part else self._names
 
     def open(self, sequence: str) -> StoredRecording:
         """Open and check one sequence.
@@ -92,32 +110,19 @@ class KittiDataset(FolderDataset):
         Raises:
             DataError: what is wrong, in which file and line, and what to do.
         """
-        drive = odometry_drive(sequence)
-        if drive is None:
-            raise DataError(
-                f"dataset.sequence={sequence}: the camera-to-vehicle calibration of this sequence is not known "
-                "(00 to 10 are): take one of those"
-            )
-        folder = self.root / "sequences" / sequence
-        if not folder.is_dir():
-            raise DataError(
-                f"{folder}: no such folder; sequences under {self.root / 'sequences'}: "
-                f"{', '.join(sorted(names_in(self.root / 'sequences'))) or 'none'}"
-            )
+        number = sequence.partition(".")[0]
+        drive = _known_drive(number)
+        folder = self.root / "sequences" / number
         findings: list[Finding] = []
         times_file = folder / "times.txt"
         times_ns = read_times(times_file)
         if len(times_ns) < 5:
             raise DataError(f"{times_file}: {len(times_ns)} frames are too few for a recording: fetch the file again")
-        imu_file = self.root / "imus_100hz_mat" / f"{sequence}.mat"
-        imu = read_imu_mat(imu_file, times_ns)
-        noise = replace(self.noise, rate_hz=sample_rate_hz(imu))
-        findings += screening.check_samples(imu, str(imu_file), noise.rate_hz)
-        findings.append(check_vehicle_up(imu, str(imu_file)))
-        truth = self._truth(sequence, drive, imu, times_ns, findings)
-        if truth is not None:
+        imu, noise = self._samples(number, times_ns, findings)
+        truth = self._truth(number, drive, imu, times_ns, findings)
+        if truth is not None and imu is not None:
             # Levelled by this accelerometer, the vertical of the truth says nothing about it.
-            findings += agreement.check_with_truth(imu, truth, str(imu_file), vertical=False)
+            findings += agreement.check_with_truth(imu, truth, str(self._files.imu_file(number)), vertical=False)
             findings.append(check_level(imu, truth))
         usable, paths, missing = self._available(folder, len(times_ns), findings)
         cameras = self._cameras(folder, drive, paths, findings)
@@ -132,13 +137,13 @@ class KittiDataset(FolderDataset):
         )
         findings += found
         paths = [[files[i] for i in kept] for files in paths]
-        rig = self._rig(cameras, noise)
+        rig = replace(self._rig(cameras, noise), has_imu=self.has_imu)
         if self.images:
             check_first_images(paths, rig.cameras, f"recording day {drive.date}", color=self.color)
         return StoredRecording(
             name=sequence,
             rig=rig,
-            imu=imu,
+            imu=ImuBlock.none() if imu is None else imu,
             frame_stamps_ns=times_ns[kept],
             image_paths=paths,
             truth=truth,
@@ -147,19 +152,17 @@ class KittiDataset(FolderDataset):
             missing_images=missing,
         )
 
-    def _all_sequences(self) -> list[str]:
-        names = sorted(
-            path.name
-            for path in self.root.glob("sequences/*")
-            if (self.root / "imus_100hz_mat" / f"{path.name}.mat").exists()
-            and (not self.images or any(folder.is_dir() for folder in self._image_folders(path)))
-        )
-        if not names:
-            raise DataError(
-                f"{self.root}: no sequence here (sequences/01 with images and imus_100hz_mat/01.mat, say, are "
-                "expected): set dataset.root, or dataset.images=false where there are none"
-            )
-        return names
+    def _samples(self, sequence: str, times_ns: Stamps, findings: list[Finding]) -> tuple[ImuBlock | None, ImuNoise]:
+        """Inertial samples, checked, or None where none are wanted, and their noise."""
+        if not self.has_imu:
+            findings.append(Finding(level="note", subject="inertial samples", text="not read (dataset.imu=none)"))
+            return None, self.noise
+        path = self._files.imu_file(sequence)
+        imu = read_imu_mat(path, times_ns)
+        noise = replace(self.noise, rate_hz=sample_rate_hz(imu))
+        findings += screening.check_samples(imu, str(path), noise.rate_hz)
+        findings.append(check_vehicle_up(imu, str(path)))
+        return imu, noise
 
     def _image_folders(self, folder: Path) -> list[Path]:
         first = 2 if self.color else 0
@@ -170,7 +173,7 @@ class KittiDataset(FolderDataset):
         if not self.images:
             return np.ones(count, dtype=bool), [], 0
         names = [f"{index:06d}.png" for index in range(count)]
-        paths = [[image_folder / name for name in names] for image_folder in self._image_folders(folder)]
+        paths = [[image_folder / name for name in names] for image_folder in self._files.image_folders(folder.name)]
         usable = find_images(paths)
         if usable.sum() < 2:
             # The camera that lacks most is the one to name.
@@ -201,7 +204,7 @@ class KittiDataset(FolderDataset):
         return cameras
 
     def _truth(
-        self, sequence: str, drive: DriveDate, imu: ImuBlock, times_ns: Stamps, findings: list[Finding]
+        self, sequence: str, drive: DriveDate, imu: ImuBlock | None, times_ns: Stamps, findings: list[Finding]
     ) -> Trajectory | None:
         path = self.root / "poses" / f"{sequence}.txt"
         if not path.exists():
@@ -214,10 +217,24 @@ class KittiDataset(FolderDataset):
                 f"{path}: {len(poses)} poses for {len(times_ns)} frames in times.txt: the files are not of one sequence"
             )
         T_ref_body = poses.T_world_body @ se3.inverse(drive.T_body_cam0)
-        truth, up_size = level_world(poses.stamps_ns, T_ref_body, imu)
-        text = f"{path}, levelled by the mean specific force (|g| {up_size:.3f} m/s²); velocity from a spline"
+        if imu is None:
+            truth, how = level_by_vehicle(poses.stamps_ns, T_ref_body), "the vehicle's mean upright axis"
+        else:
+            truth, up_size = level_world(poses.stamps_ns, T_ref_body, imu)
+            how = f"the mean specific force (|g| {up_size:.3f} m/s²)"
+        text = f"{path}, levelled by {how}; velocity from a spline"
         findings.append(Finding(level="good", subject="ground truth file", text=text))
         return truth
+
+
+def _known_drive(sequence: str) -> DriveDate:
+    drive = odometry_drive(sequence)
+    if drive is None:
+        raise DataError(
+            f"dataset.sequence={sequence}: the camera-to-vehicle calibration of this sequence is not known "
+            "(00 to 10 are): take one of those"
+        )
+    return drive
 
 
 def read_imu_mat(path: Path, times_ns: Stamps) -> ImuBlock:
@@ -252,61 +269,3 @@ def read_imu_mat(path: Path, times_ns: Stamps) -> ImuBlock:
     inner = times_ns[:-1, None] + steps * np.arange(SAMPLES_PER_FRAME) // SAMPLES_PER_FRAME
     stamps_ns = np.concatenate([inner.ravel(), times_ns[-1:]])
     return ImuBlock(stamps_ns=stamps_ns, gyro=samples[:, 3:].copy(), accel=samples[:, :3].copy())
-
-
-def check_vehicle_up(imu: ImuBlock, where: str) -> Finding:
-    """A car stays upright: the mean specific force must be +g along the vehicle's z.
-
-    Raises:
-        DataError: it is not; axes or columns are swapped.
-    """
-    force = imu.accel.mean(axis=0)
-    tilt = agreement.tilt_deg(force)
-    if tilt > agreement.TILT_BAD_DEG:
-        raise DataError(
-            f"{where}: the mean specific force is ({force[0]:.2f}, {force[1]:.2f}, {force[2]:.2f}) m/s², {tilt:.0f}° "
-            "from the vehicle's z axis, but a car stays upright: columns or axes are swapped; put them right"
-        )
-    text = f"mean specific force {force[2]:.2f} m/s² along the vehicle's z, {tilt:.1f}° off (banked and crowned road)"
-    return Finding(level="good", subject="vehicle upright", text=text)
-
-
-def check_level(imu: ImuBlock, truth: Trajectory) -> Finding:
-    """Whether both halves of a recording agree on the vertical, which one average over both cannot tell."""
-    middle = len(truth) // 2
-    tilts = []
-    for part in (slice(None, middle), slice(middle, None)):
-        half = Trajectory(stamps_ns=truth.stamps_ns[part], T_world_body=truth.T_world_body[part])
-        if truth.v_world_body is not None:
-            half = replace(half, v_world_body=truth.v_world_body[part])
-        tilts.append(agreement.tilt_deg(agreement.mean_specific_force(imu, half)[0]))
-    text = f"the halves of the recording put the vertical {tilts[0]:.2f}° and {tilts[1]:.2f}° off the whole"
-    return Finding(level="good" if max(tilts) < 1.0 else "note", subject="level of the world", text=text)
-
-
-def level_world(stamps_ns: Stamps, T_ref_body: Array, imu: ImuBlock) -> tuple[Trajectory, float]:
-    """Turn poses in any fixed frame into poses in a world with z up.
-
-    Up is the specific force averaged over all samples in the true attitude, less the mean acceleration
-    of the body: ``u = (1/T) ∫ R_ref_body a dt − (v(T) − v(0)) / T``. KITTI's odometry poses start with
-    camera 0, which looks up or down by a degree or so. The heading is free: the body starts along x.
-
-    Args:
-        stamps_ns: (N,) of the poses, IMU clock.
-        T_ref_body: (N, 4, 4).
-        imu: samples that cover most of the poses.
-
-    Returns:
-        The trajectory with velocities, starting at the origin, and the magnitude of u in m/s².
-    """
-    velocity = spline_velocities(stamps_ns, T_ref_body[:, :3, 3])
-    reference = Trajectory(stamps_ns=stamps_ns, T_world_body=T_ref_body, v_world_body=velocity)
-    up, _ = agreement.mean_specific_force(imu, reference)
-    R_level_ref = so3.from_two_vectors(up, np.array([0.0, 0.0, 1.0]))
-    heading = R_level_ref @ T_ref_body[0, :3, 0]
-    R_world_ref = so3.rotation_z(-np.arctan2(heading[1], heading[0])) @ R_level_ref
-    T_world_ref = se3.from_parts(R_world_ref, -R_world_ref @ T_ref_body[0, :3, 3])
-    truth = Trajectory(
-        stamps_ns=stamps_ns, T_world_body=T_world_ref @ T_ref_body, v_world_body=velocity @ R_world_ref.T
-    )
-    return truth, float(np.linalg.norm(up))

@@ -182,6 +182,8 @@ class RerunViewer(Viewer):
         import rerun as rr
 
         imu = measurement.window.imu
+        if not len(imu):
+            return
         # The sample at the end of a window is the first of the next one.
         times = rr.TimeColumn(TIMELINE, timestamp=imu.stamps_ns[1:].astype("datetime64[ns]"))
         for name, values in (("gyro", imu.gyro), ("accel", imu.accel)):

@@ -1,5 +1,6 @@
 """What both synchronizers share: the queues, the waiting and the counting."""
 
+import itertools
 import logging
 from abc import abstractmethod
 from collections import Counter, deque
@@ -33,6 +34,9 @@ class BufferedSynchronizer(Synchronizer):
     and ``gap_ns`` says how long nothing was measured. Samples are kept from the last frame on, so memory
     is bounded by the longest time without a frame.
 
+    Where the rig has no inertial sensor nothing is waited for: each frame makes a window, without samples,
+    with the one before.
+
     Args:
         max_wait_s: how long a frame waits for inertial samples, s of stream time, before it is dropped; also
             how far the packets of the two sensors may be out of order.
@@ -53,6 +57,7 @@ class BufferedSynchronizer(Synchronizer):
     def setup(self, rig: SensorRig) -> None:
         """Empty the queues and take the camera delay and the inertial rate of the next sequence."""
         self._delay_ns = rig.camera_delay_ns
+        self._has_imu = rig.has_imu
         self._max_gap_ns = round(max(self._max_gap_s, 2.5 / rig.imu.rate_hz) * NANOSECONDS)
         self._blocks: deque[ImuBlock] = deque()
         self._newest_imu_ns: int | None = None
@@ -83,7 +88,10 @@ class BufferedSynchronizer(Synchronizer):
             self._take_frame(packet)
         else:
             self._take_samples(packet)
-        windows = self._complete() if self._waiting else []
+        if not self._waiting:
+            windows = []
+        else:
+            windows = self._complete() if self._has_imu else self._pair()
         self._forget()
         return windows
 
@@ -94,7 +102,7 @@ class BufferedSynchronizer(Synchronizer):
         for frame in self._waiting:
             self._drop(frame, "no inertial sample follows it to the end of the recording")
         self._waiting = []
-        if not self._emitted and self._newest_frame_ns is not None:
+        if self._has_imu and not self._emitted and self._newest_frame_ns is not None:
             log.warning(
                 "no frame could be paired with inertial samples: the last frame is at %d ns, the last sample at %s ns "
                 "(IMU clock); check that both clocks overlap",
@@ -205,6 +213,24 @@ class BufferedSynchronizer(Synchronizer):
             gap_ns=int((around[1:] - around[:-1]).max()),
             camera_delay_ns=delay_ns,
         )
+
+    def _pair(self) -> list[SyncedWindow]:
+        """Windows of the waiting frames alone."""
+        frames = self._waiting if self._previous is None else [self._previous, *self._waiting]
+        windows = [
+            SyncedWindow(
+                previous=previous,
+                current=current,
+                imu=ImuBlock.none(),
+                gap_ns=current.stamp_ns - previous.stamp_ns,
+                camera_delay_ns=self._delays[current.stamp_ns],
+            )
+            for previous, current in itertools.pairwise(frames)
+        ]
+        self._previous = frames[-1]
+        self._waiting = []
+        self._delays.clear()
+        return windows
 
     def _joined(self) -> ImuBlock:
         if len(self._blocks) > 1:

@@ -1,6 +1,7 @@
 """The pipeline: wiring, order of calls, one path for streams and recordings, honest timers."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from vioframe.interfaces import (
     STEREO,
     Frontend,
     Fuser,
+    InertialIntegrator,
     Synchronizer,
     VOEstimator,
 )
@@ -141,6 +143,19 @@ def test_recording_without_the_cameras_is_refused_at_setup():
     blind = SensorRig(cameras=SCENE.rig.cameras, imu=SCENE.rig.imu, has_images=False)
     with pytest.raises(WiringError, match="gives 0"):
         pipeline.setup(blind)
+
+
+class Counts(InertialIntegrator):
+    def integrate(self, imu, bias):
+        raise NotImplementedError
+
+
+def test_recording_without_inertial_samples_is_refused_by_who_integrates():
+    bare = replace(SCENE.rig, has_imu=False)
+    pipeline = Pipeline(synchronizer=Replay(), integrator=Counts(), fuser=Keep(), choices={"integrator": "paper"})
+    with pytest.raises(WiringError, match=r"integrator=paper needs inertial samples.*integrator=none"):
+        pipeline.setup(bare)
+    Pipeline(synchronizer=Replay(), vo=Steps(), fuser=Keep()).setup(bare)
 
 
 def test_calls_out_of_order_are_refused():

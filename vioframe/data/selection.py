@@ -70,19 +70,36 @@ class FrameSelection:
         every: stream each such frame, from 1.
         start_s: seconds to leave out at the start.
         duration_s: seconds to stream; None streams to the end.
+        stretch: shares of all usable frames at which the recording begins and ends, before the others are applied.
+            What ends where another begins shares no frame with it, and both together leave none out.
+
+    Raises:
+        ConfigError: with the key and its value.
     """
 
     every: int
     start_s: float
     duration_s: float | None
+    stretch: Sequence[float] = (0.0, 1.0)
 
     def __post_init__(self) -> None:
+        numbers = len(self.stretch) == 2 and all(isinstance(share, int | float) for share in self.stretch)
+        if not numbers or not 0.0 <= self.stretch[0] < self.stretch[1] <= 1.0:
+            raise ConfigError(
+                f"dataset.stretch must be two shares [from, to] with 0 ≤ from < to ≤ 1, got {list(self.stretch)}"
+            )
         if not self.every >= 1:
             raise ConfigError(f"dataset.every must be 1 or more, got {self.every}")
         if not self.start_s >= 0.0:
             raise ConfigError(f"dataset.start_s must not be negative, got {self.start_s}")
         if self.duration_s is not None and not self.duration_s > 0.0:
             raise ConfigError(f"dataset.duration_s must be positive or null, got {self.duration_s}")
+
+    @property
+    def part(self) -> str:
+        """What the stretch is called, in per cent of the recording, such as ``90-100``; empty for all of it."""
+        first, last = (f"{100.0 * share:g}" for share in self.stretch)
+        return "" if (first, last) == ("0", "100") else f"{first}-{last}"
 
     def choose(self, stamps_ns: Stamps, usable: Mask, where: str) -> Stamps:
         """Indices of the frames to stream.
@@ -95,6 +112,7 @@ class FrameSelection:
         Raises:
             DataError: fewer than two are left.
         """
+        usable = self._within_stretch(usable)
         first = int(stamps_ns[usable][0]) if usable.any() else int(stamps_ns[0])
         begin = first + round(self.start_s * NANOSECONDS)
         end = int(stamps_ns[-1]) if self.duration_s is None else begin + round(self.duration_s * NANOSECONDS)
@@ -102,9 +120,18 @@ class FrameSelection:
         if len(kept) < 2:
             raise DataError(
                 f"{where}: {len(kept)} of {len(stamps_ns)} frames are left by dataset.start_s={self.start_s:g}, "
-                f"duration_s={self.duration_s} and every={self.every}, but two are needed: change them"
+                f"duration_s={self.duration_s}, every={self.every} and stretch={list(self.stretch)}, but two are "
+                "needed: change them"
             )
         return kept
+
+    def _within_stretch(self, usable: Mask) -> Mask:
+        numbers = np.flatnonzero(usable)
+        # Rounded the same way at both ends: where one stretch ends the next begins.
+        begin, end = (round(share * len(numbers)) for share in self.stretch)
+        inside = np.zeros_like(usable)
+        inside[numbers[begin:end]] = True
+        return inside
 
 
 def match_stamps(left_ns: Stamps, right_ns: Stamps) -> tuple[Stamps, Stamps]:
@@ -130,7 +157,7 @@ def sample_span(imu: ImuBlock, arrivals_ns: Stamps) -> tuple[int, int]:
 
 def choose_frames(
     stamps_ns: Stamps,
-    imu: ImuBlock,
+    imu: ImuBlock | None,
     selection: FrameSelection,
     *,
     delay_ns: int,
@@ -142,7 +169,7 @@ def choose_frames(
 
     Args:
         stamps_ns: (F,) of all frames, camera clock.
-        imu: all samples.
+        imu: all samples; None where images alone are streamed.
         selection: the options.
         delay_ns: ``t_imu = t_cam + delay``.
         where: file or topic of the stamps, for messages.
@@ -153,9 +180,13 @@ def choose_frames(
         ClockError: the clocks of camera and IMU do not overlap.
         DataError: fewer than two frames are left.
     """
-    covered, clocks = screening.check_frame_clock(stamps_ns, imu, delay_ns, where)
+    findings: list[Finding] = []
+    covered = np.ones(len(stamps_ns), dtype=np.bool_)
+    if imu is not None:
+        covered, clocks = screening.check_frame_clock(stamps_ns, imu, delay_ns, where)
+        findings.append(clocks)
     kept = selection.choose(stamps_ns, covered if usable is None else covered & usable, where)
-    findings = [clocks, screening.check_frame_steps(stamps_ns[kept])]
+    findings.append(screening.check_frame_steps(stamps_ns[kept]))
     if truth is not None:
         findings.append(screening.check_truth_of_frames(stamps_ns[kept] + delay_ns, truth))
     return kept, findings

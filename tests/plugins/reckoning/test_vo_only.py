@@ -1,5 +1,7 @@
 """Composed camera motions: the lever arm, the start, lost windows, and the covariance."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from vioframe.conventions import NANOSECONDS
 from vioframe.errors import ConfigError, StateError
 from vioframe.geometry import se3, so3
 from vioframe.testing import check_component
-from vioframe.types import Camera, Measurement, NavState, RelativePose, SensorRig
+from vioframe.types import Camera, ImuBlock, Measurement, NavState, RelativePose, SensorRig
 from vioframe_reckoning import VoOnlyFuser
 
 T_BODY_CAM = se3.from_parts(so3.exp(np.array([1.2, -1.1, 1.3])), np.array([0.4, -0.2, 0.3]))
@@ -105,6 +107,13 @@ def test_starts_level_at_the_origin_by_itself() -> None:
     assert not states[0].T_world_body[:3, 3].any()
     plain = follow(fuser_with(level=False), [relative(0)])
     np.testing.assert_array_equal(plain[0].T_world_body, np.eye(4))
+
+
+def test_starts_along_its_own_axes_where_there_are_no_samples() -> None:
+    window = replace(WINDOWS[0], imu=ImuBlock.none())
+    first, second = fuser_with().update(Measurement(window=window, relative_pose=relative(0)))
+    np.testing.assert_array_equal(first.T_world_body, np.eye(4))
+    np.testing.assert_allclose(second.T_world_body, se3.inverse(POSES[0]) @ POSES[1], atol=1e-9)
 
 
 def test_a_given_velocity_carries_the_body_until_the_first_motion() -> None:

@@ -10,9 +10,10 @@ from vioframe.errors import ClockError, ConfigError, DataError
 from vioframe.geometry import so3
 from vioframe.types import Frame
 from vioframe_recordings import KittiDataset, KittiRawDataset
-from vioframe_recordings.kitti import level_world, read_imu_mat
+from vioframe_recordings.kitti import read_imu_mat
 from vioframe_recordings.kitti_calibration import DRIVE_DATES, spline_velocities
 from vioframe_recordings.kitti_inertial import read_date_stamps
+from vioframe_recordings.kitti_level import level_world
 
 Maker = Callable[..., Path]
 
@@ -122,7 +123,11 @@ KITTI_CASES: dict[str, tuple[Callable[[Path], None], type[DataError], str]] = {
         DataError,
         r"06.mat: cannot be read",
     ),
-    "no mat": (lambda root: (root / "imus_100hz_mat" / "06.mat").unlink(), DataError, r"06.mat: no such file"),
+    "no mat": (
+        lambda root: (root / "imus_100hz_mat" / "06.mat").unlink(),
+        DataError,
+        r"lacks imus_100hz_mat/06.mat, .*imu=none",
+    ),
     "calibration key": (edit("sequences/06/calib.txt", "P0:", "Q0:"), DataError, r"calib.txt: the key 'P0' is missing"),
     "calibration number": (edit("sequences/06/calib.txt", "7.07e+02", "seven"), DataError, r"calib.txt:1: .*'P0'"),
     "times repeated": (edit("sequences/06/times.txt", "1.038000e-01", "0.0"), ClockError, r"times.txt:2: .*repeats"),
@@ -150,13 +155,61 @@ def test_odometry_choices(make_kitti: Maker) -> None:
     assert list(KittiDataset(root=str(root), sequence=6, images=False).sequences) == ["06"]
     with pytest.raises(DataError, match=r"dataset.sequence=11"):
         KittiDataset(root=str(root), sequence="11").open("11")
-    with pytest.raises(DataError, match=r"07: no such folder; sequences under .*: 06"):
-        KittiDataset(root=str(root), sequence="07").open("07")
+    # All that is missing, before anything is read, and what could be run instead.
+    with pytest.raises(DataError, match=r"lacks sequences/05, sequences/07, .*fetch them, .*: dataset.sequence=\[6\]"):
+        KittiDataset(root=str(root), sequence=["05", 6, 7], images=False, cameras=2)
+    with pytest.raises(DataError, match=r"lacks sequences/06/image_0, .*fetch it.*images=false dataset.sequence=\[6\]"):
+        KittiDataset(root=str(root), sequence="06")
+    (root / "sequences" / "06" / "image_0").mkdir()
+    with pytest.raises(DataError, match=r"color=false dataset.sequence=\[6\]"):
+        KittiDataset(root=str(root), sequence="06", color=True)
     with pytest.raises(DataError, match=r"image_0: has images of 0 of 60 frames"):
         KittiDataset(root=str(root), sequence="06").open("06")
+    (root / "sequences" / "06" / "image_0").rmdir()
     write_frames(root, "image_0", range(5), (1241, 376))
     with pytest.raises(DataError, match=r"000000.png: the image is 1241×376 px but the calibration says 1226×370"):
         KittiDataset(root=str(root), sequence="06").open("06")
+
+
+def test_stretches_share_no_image_and_lose_none(make_kitti: Maker) -> None:
+    root = make_kitti()
+    write_frames(root, "image_0", range(3, 50))
+    seen = []
+    for stretch in ([0.0, 0.7], [0.7, 0.85], [0.85, 1.0]):
+        dataset = KittiDataset(root=str(root), sequence=6, stretch=stretch)
+        (name,) = dataset.sequences
+        assert name == f"06.{100 * stretch[0]:g}-{100 * stretch[1]:g}"
+        recording = dataset.open(name)
+        assert recording.name == name
+        frames = [p for p in recording.packets() if isinstance(p, Frame)]
+        seen.append([int(frame.images[0][0, 0]) for frame in frames])
+    assert [value for part in seen for value in part] == list(range(3, 50))
+    assert [len(part) for part in seen] == [33, 7, 7]
+    assert list(KittiDataset(root=str(root), sequence=6).sequences) == ["06"]
+    for stretch in ([0.9], [0.5, 0.5], [-0.1, 1.0], ["a", "b"]):
+        with pytest.raises(ConfigError, match=r"dataset\.stretch must be two shares"):
+            KittiDataset(root=str(root), stretch=stretch)
+
+
+def test_vision_alone_needs_no_inertial_file(make_kitti: Maker) -> None:
+    root = make_kitti()
+    with_samples = KittiDataset(root=str(root), images=False, camera_delay_s=0.0).open("06").ground_truth()
+    (root / "imus_100hz_mat" / "06.mat").unlink()
+    with pytest.raises(DataError, match=r"dataset.imu=none"):
+        KittiDataset(root=str(root), images=False)
+    dataset = KittiDataset(root=str(root), images=False, imu="none")
+    assert list(dataset.sequences) == ["06"]
+    recording = dataset.open("06")
+    packets = list(recording.packets())
+    assert len(packets) == 60 and all(isinstance(packet, Frame) for packet in packets)
+    assert not recording.rig.has_imu and recording.rig.camera_delay_ns == 0
+    truth = recording.ground_truth()
+    assert truth is not None and with_samples is not None
+    # The made-up car drives on a plane, so its own upright axis is that of gravity.
+    np.testing.assert_allclose(truth.T_world_body, with_samples.T_world_body, atol=0.1)
+    assert not [f for f in recording.findings() if f.level == "bad"]
+    with pytest.raises(ConfigError, match=r"dataset\.imu must be required or none"):
+        KittiDataset(root=str(root), imu="some")  # type: ignore[arg-type]
 
 
 def test_levelling_undoes_any_tilt(make_kitti: Maker) -> None:

@@ -13,8 +13,8 @@ from vioframe.errors import DataError
 from vioframe.geometry.interpolation import interpolate_poses
 from vioframe.types import Frame, ImuBlock, Trajectory
 from vioframe_recordings import EurocDataset, KittiDataset, KittiRawDataset, TumviDataset
-from vioframe_recordings.kitti import check_level
 from vioframe_recordings.kitti_calibration import drive_date
+from vioframe_recordings.kitti_level import check_level
 from vioframe_recordings.stored import StoredRecording
 
 EUROC = ["MH_01_easy", "MH_04_difficult", "V1_01_easy", "V1_02_medium", "V2_01_easy"]
@@ -135,6 +135,16 @@ def test_kitti_samples_lag_by_the_default_delay(name: str) -> None:
         measured, true = agreement.rotation_rates(recording.imu, truth_of(recording))
         residuals.append(float((measured - true)[5:-5, 2].std()))
     assert residuals[1] < 0.5 * min(residuals[0], residuals[2])
+
+
+@pytest.mark.parametrize("name", KITTI)
+def test_kitti_is_level_without_an_accelerometer(name: str) -> None:
+    """The vehicle's own upright axis is within a few degrees of gravity; 04 is a short straight road."""
+    ups = []
+    for imu in ("required", "none"):
+        dataset = KittiDataset(root=str(kitti_root()), sequence=name, images=False, camera_delay_s=0.0, imu=imu)
+        ups.append(truth_of(dataset.open(name)).T_world_body[0, 2, :3])
+    assert np.degrees(np.arccos(ups[0] @ ups[1])) < 3.0
 
 
 def test_kitti_flat_town_is_flat() -> None:

@@ -2,6 +2,7 @@
 
 import itertools
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -175,6 +176,17 @@ def test_crossed_frames_are_put_in_order(cls: type[Synchronizer]) -> None:
     windows = run(synchronizer, [frame(30), frame(10), frame(50), block(np.arange(0, 100, 5))])
     assert ends(windows) == [(10, 30), (30, 50)]
     assert not any(synchronizer.counters().values())
+
+
+@pytest.mark.parametrize("cls", BOTH)
+def test_images_alone_make_windows_at_once_and_without_samples(cls: type[Synchronizer]) -> None:
+    synchronizer = cls()
+    synchronizer.setup(replace(make_rig(NOISE, camera_delay_ns=5 * MS), has_imu=False))
+    windows = [synchronizer.push(frame(ms)) for ms in (0.0, 100.0, 200.0, 150.0, 300.0)]
+    # The one that came after a later one had been used is late, as ever.
+    assert [ends(each) for each in windows] == [[], [(5, 105)], [(105, 205)], [], [(205, 305)]]
+    assert [(len(w.imu), w.gap_ns, w.camera_delay_ns) for w in windows[1]] == [(0, 100 * MS, 5 * MS)]
+    assert synchronizer.flush() == [] and synchronizer.counters()["dropped frames"] == 1
 
 
 @pytest.mark.parametrize("cls", BOTH)
