@@ -103,6 +103,10 @@ class WindowBatch:
         """The same batch on another device."""
         return self._map(lambda tensor: tensor.to(device, non_blocking=non_blocking))
 
+    def first(self) -> Self:
+        """Its first window, as a batch of one."""
+        return self._map(lambda tensor: tensor[:1])
+
     def pin_memory(self) -> Self:
         """The same batch in page-locked memory; a DataLoader calls it by this name."""
         return self._map(lambda tensor: tensor.pin_memory())

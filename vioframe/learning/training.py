@@ -24,7 +24,17 @@ from vioframe import __version__
 from vioframe.data.windows import StoredSequence, WindowIndex
 from vioframe.errors import DataError
 from vioframe.interfaces import Trainable
-from vioframe.learning.callbacks import Bar, BestPicture, BestWeights, Curve, ResumePoint, Row, StopDivergence
+from vioframe.learning.callbacks import (
+    Bar,
+    BestPicture,
+    BestWeights,
+    Curve,
+    CurvePicture,
+    FlowPicture,
+    ResumePoint,
+    Row,
+    StopDivergence,
+)
 from vioframe.learning.datamodule import WindowData
 from vioframe.learning.module import TrainingModule
 from vioframe.learning.options import TrainerOptions
@@ -128,8 +138,9 @@ def train_parts(
     curve = Curve(folder, tracker)
     # The bar comes first, to be gone when another raises; the curve before what is saved; the resume point last.
     watchers: list[Callback] = [Bar()] if shown else []
-    watchers += [StopDivergence(options.divergence_factor, options.learning_rate), best, BestPicture(folder, tracker)]
-    watchers += [curve, ResumePoint(folder)]
+    watchers += [StopDivergence(options.divergence_factor, options.learning_rate), best]
+    watchers += [BestPicture(folder, tracker), FlowPicture(folder, tracker)]
+    watchers += [curve, CurvePicture(curve, constant, folder, tracker), ResumePoint(folder)]
     folder.mkdir(parents=True, exist_ok=True)
     trainer = _trainer(options, folder, watchers)
     _fit(trainer, module, data, options)
