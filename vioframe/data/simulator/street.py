@@ -298,6 +298,9 @@ class StreetBuilder:
     def _set_moving(self, at: Array, heading: Array, count: int) -> None:
         """People on the pavements, to and fro."""
         rng = self._rng
+        if len(at) <= 5:
+            # So short a street has no place where who walks would not be stepped on.
+            return
         for index in rng.choice(np.arange(5, len(at)), size=min(count, len(at) - 5), replace=False):
             left = LANE_M + rng.choice([-1.0, 1.0]) * (_KERB_M + 1.4)
             low, high = self._span(at[index], heading[index], (0.0, 0.0), (left, left))

@@ -183,3 +183,13 @@ def test_another_size_keeps_the_field_of_view() -> None:
     corner_large = camera_models.normalised(large, np.array([-0.5, -0.5]))
     corner_small = camera_models.normalised(small, np.array([-0.5, -0.5]))
     np.testing.assert_allclose(corner_large, corner_small, atol=1e-9)
+
+
+@pytest.mark.parametrize("duration_s", [0.2, 3.0, 5.0])
+def test_a_drive_that_hardly_leaves_has_a_street_all_the_same(duration_s: float) -> None:
+    camera = CameraSettings(size_px=(64, 20))
+    spoilt = Degradations(moving_objects=3)
+    dataset = SimulatedDataset(sequence="car", duration_s=duration_s, camera=camera, degradations=spoilt)
+    frames = [packet for packet in dataset.open("car-0").packets() if isinstance(packet, Frame)]
+    assert len(frames) == round(10 * duration_s) + 1
+    assert min(frame.images[0].std() for frame in frames) > 10.0
