@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vioframe.sweep.curves import draw_curves, find_curves
 from vioframe.sweep.jobs import JobResult
 from vioframe.sweep.summary import Column, SeedGroup, Summary, choices_but_seeds
 
@@ -15,7 +16,9 @@ _Row = tuple[str, list[JobResult], SeedGroup | None]
 
 
 def draw_chart(summary: Summary, path: Path) -> bool:
-    """Draw bars of the compared metrics, a row a job (or, with seeds, a row a group and a dot a seed).
+    """Draw the compared metrics: over the number that a sweep varies, if that is all it varies beside one other choice.
+
+    Otherwise as bars, a row a job (or, with seeds, a row a group and a dot a seed).
 
     Returns:
         whether there was anything to draw.
@@ -25,6 +28,10 @@ def draw_chart(summary: Summary, path: Path) -> bool:
     columns = [column for column in columns if column.key != "ate_se3_percent"]
     if not columns:
         return False
+    curves = find_curves(summary)
+    if curves is not None:
+        draw_curves(summary, columns, curves, path)
+        return True
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

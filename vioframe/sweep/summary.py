@@ -12,13 +12,23 @@ _SEED = re.compile(r"(^|[._])seeds?$")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Column:
-    """A metric the summary shows: its key in ``metrics_of``, heading, decimals, factor, and which way is better."""
+    """A metric the summary shows.
+
+    Attributes:
+        key: in ``metrics_of``.
+        title: heading.
+        decimals: shown.
+        factor: what values are multiplied with to be shown.
+        lower_is_better: which way is better.
+        nets: shown only where jobs have nets (True), only where none has (False), or always (None).
+    """
 
     key: str
     title: str
     decimals: int
     factor: float = 1.0
     lower_is_better: bool = True
+    nets: bool | None = None
 
     def winner(self, values: Iterable[float]) -> float | None:
         """Return the best of several values; ``None`` where they are all the same, and nobody wins."""
@@ -34,10 +44,14 @@ class Column:
 
 COLUMNS = (
     Column(key="ate_se3_m", title="ATE [m]", decimals=3),
-    Column(key="ate_se3_percent", title="ATE [% path]", decimals=2),
+    Column(key="ate_se3_percent", title="ATE [% path]", decimals=2, nets=False),
     Column(key="t_rel_percent", title="t_rel [%]", decimals=2),
+    Column(key="r_rel_deg_per_100m", title="r_rel [°/100 m]", decimals=2, nets=True),
     Column(key="completion", title="completion [%]", decimals=1, factor=100.0, lower_is_better=False),
-    Column(key="real_time_factor", title="real-time factor", decimals=2, lower_is_better=False),
+    Column(key="real_time_factor", title="real-time factor", decimals=2, lower_is_better=False, nets=False),
+    Column(key="ms_per_frame.total", title="ms/frame", decimals=1, nets=True),
+    Column(key="model.gmac", title="GMAC", decimals=2, nets=True),
+    Column(key="model.parameters", title="parameters [M]", decimals=2, factor=1e-6, nets=True),
 )
 """What the table compares; everything else is in the CSV."""
 
@@ -78,8 +92,12 @@ class Summary:
 
     def columns(self) -> list[Column]:
         """Return the columns of which at least one job has a value; the first always."""
+        nets = any("model.parameters" in job.metrics for job in self.jobs)
         return [
-            column for column in COLUMNS if column is COLUMNS[0] or any(column.key in job.metrics for job in self.jobs)
+            column
+            for column in COLUMNS
+            if column is COLUMNS[0]
+            or (column.nets in (None, nets) and any(column.key in job.metrics for job in self.jobs))
         ]
 
     def metrics(self) -> dict[str, float]:
@@ -109,7 +127,7 @@ def summarise(jobs: Sequence[JobResult]) -> Summary:
     groups: dict[tuple[str, ...], list[JobResult]] = {}
     for job in jobs:
         groups.setdefault(choices_but_seeds(job), []).append(job)
-    seeded = any(_SEED.search(key) for key in varied)
+    seeded = any(is_seed(key) for key in varied)
     return Summary(
         jobs=tuple(jobs),
         varied=varied,
@@ -134,7 +152,12 @@ def _group(choices: tuple[str, ...], members: Sequence[JobResult]) -> SeedGroup:
 
 def choices_but_seeds(job: JobResult) -> tuple[str, ...]:
     """Return a job's overrides other than seeds: what the jobs of a ``SeedGroup`` share."""
-    return tuple(text for text in job.overrides if not _SEED.search(override_key(text)))
+    return tuple(text for text in job.overrides if not is_seed(override_key(text)))
+
+
+def is_seed(key: str) -> bool:
+    """Tell whether an override of this key is a seed."""
+    return _SEED.search(key) is not None
 
 
 def override_key(override: str) -> str:
