@@ -58,6 +58,18 @@ def test_another_width_and_stack_are_named(saved):
     refused(path, TinyVo(context=3), r"context=1 where 3 is needed")
 
 
+def test_another_part_is_told_without_its_details(saved, monkeypatch):
+    part, path = saved
+    other = {"part": "flow", "warps": 5}
+    monkeypatch.setattr(TinyVo, "architecture", property(lambda self: other))
+    refused(path, part, r"holds weights of 'tiny', not of 'flow'")
+
+
+def test_a_folder_is_no_file(tmp_path):
+    with pytest.raises(ConfigError, match=r"is a folder: name one of its .safetensors files"):
+        locate_weights(str(tmp_path), "vo.weights")
+
+
 @pytest.mark.parametrize("keep", [0, 4, 200, 2000])
 def test_truncated_file(saved, keep):
     part, path = saved

@@ -72,6 +72,8 @@ def locate_weights(source: str, key: str) -> Path:
     """
     if not source.startswith(_SCHEMES):
         path = Path(source).expanduser()
+        if path.is_dir():
+            raise ConfigError(f"{key}={source} is a folder: name one of its .safetensors files")
         if not path.is_file():
             raise ConfigError(f"{key}={source}: there is no such file; train one with task=train")
         return path
@@ -129,6 +131,11 @@ def _check_header(header: Mapping[str, str], part: Trainable, path: Path, key: s
     if not isinstance(stored, dict):
         raise DataError(f"{key}={path} does not say of which architecture it is: train it again")
     wanted = dict(part.architecture)
+    if stored.get("part") != wanted.get("part"):
+        raise DataError(
+            f"{key}={path} holds weights of {stored.get('part')!r}, not of {wanted.get('part')!r}: give the file that "
+            "was trained for this part"
+        )
     differing = [
         f"{name}={stored.get(name)!r} where {wanted.get(name)!r} is needed"
         for name in sorted({*stored, *wanted})
@@ -145,7 +152,7 @@ def _check_state(state: Mapping[str, torch.Tensor], part: Trainable, path: Path,
     if set(state) != set(own):
         odd = sorted(set(state) ^ set(own))
         raise DataError(
-            f"{key}={path} does not fit the net: {len(odd)} tensors are in only one of them, such as {odd[0]!r}"
+            f"{key}={path} does not fit the net: {odd[0]!r} and {len(odd) - 1} others are in one of them only"
         )
     for name, tensor in state.items():
         if tensor.shape != own[name].shape:

@@ -1,5 +1,6 @@
 """The temporal stream's choices, their first convolution for flow, and ImageNet files for them."""
 
+import pickle
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -99,6 +100,11 @@ def _read(path: Path) -> dict[str, Tensor]:
             found: object = load_file(path)
         else:
             found = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise DataError(
+            f"backbone.weights: {path} is not a readable file of weights: it is damaged, or holds more than tensors, "
+            "which could run code; fetch torchvision's own"
+        ) from error
     except Exception as error:
         # A damaged or hostile file may fail anywhere in the reader, with any exception.
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
