@@ -59,9 +59,13 @@ class StopDivergence(Callback):
         limit = min(self._least, self._first) + self._factor * max(abs(self._first), abs(min(self._least, self._first)))
         if not math.isfinite(mean) or mean > limit:
             was = "" if math.isinf(self._least) else f", after {self._least:.3g} at best"
+            kept = (
+                "The best weights from before are kept"
+                if trainer.current_epoch
+                else "No epoch was complete, so there are no weights to keep"
+            )
             raise ConfigError(
                 f"trainer.learning_rate={self._learning_rate:g} makes the training diverge: the loss is {mean:.3g} at "
-                f"step {trainer.global_step}{was}; choose a smaller one, or a smaller trainer.gradient_clip. The best "
-                "weights from before are kept"
+                f"step {trainer.global_step}{was}; choose a smaller one, or a smaller trainer.gradient_clip. {kept}"
             )
         self._least = min(self._least, mean)
