@@ -33,6 +33,7 @@ def options(folder, **changes) -> TrainerOptions:
         "batch_size": 4,
         "pairs": None,
         "size_px": [64, 48],
+        "width": 1.0,
         "channels": 1,
         "cache": str(folder / "cache"),
         "train": None,

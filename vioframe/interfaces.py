@@ -214,6 +214,8 @@ class Trainable(Protocol):
         context_pairs: how many pairs of images in a row one answer takes, 1 or more.
         architecture: plain values on which a file of weights must agree with this part, such as
             ``{"part": "tsvo", "backbone": "resnet50", "stack": 10}``.
+        needs_training: its answers mean nothing yet: it was given no weights, and does not work without any. An
+            experiment trains such a part first.
     """
 
     @property
@@ -228,6 +230,11 @@ class Trainable(Protocol):
 
     @property
     def architecture(self) -> Mapping[str, str | int | float | bool]:
+        """See the class."""
+        ...
+
+    @property
+    def needs_training(self) -> bool:
         """See the class."""
         ...
 

@@ -38,7 +38,7 @@ class DisFrontend(FlowFrontend):
         descent_steps: Gauss–Newton steps a patch; None as the preset.
         refinement_steps: of the variational refinement, 0 leaves it out; None as the preset.
         quantise: round flow to 256 levels.
-        bound_px: flow at the last of them.
+        bound: flow at the last of them, as a share of the image's width.
         cache: folder in which flows are kept, or None.
 
     Raises:
@@ -46,6 +46,7 @@ class DisFrontend(FlowFrontend):
     """
 
     context_pairs = 1
+    needs_training = False
 
     def __init__(
         self,
@@ -56,10 +57,10 @@ class DisFrontend(FlowFrontend):
         descent_steps: int | None = None,
         refinement_steps: int | None = None,
         quantise: bool = True,
-        bound_px: float = 48.0,
+        bound: float = 0.09375,
         cache: str | None = None,
     ) -> None:
-        super().__init__(name="dis", size_px=size_px, quantise=quantise, bound_px=bound_px, cache=cache, batch=1)
+        super().__init__(name="dis", size_px=size_px, quantise=quantise, bound=bound, cache=cache, batch=1)
         require("preset", preset, preset in _PRESETS, f"one of {', '.join(_PRESETS)}")
         self._preset = preset
         self._solver = cv2.DISOpticalFlow.create(_PRESETS[preset])

@@ -30,7 +30,7 @@ class FlowFrontend(Frontend):
         size_px: (width, height) to which images are brought first, and the size of the flow, whose pixels are those
             of that size; None keeps the image.
         quantise: round flow to 256 levels.
-        bound_px: flow at the last of them.
+        bound: flow at the last of them, as a share of the image's width.
         cache: folder, or None.
         batch: most pairs solved at once by :meth:`process_many`.
 
@@ -46,7 +46,7 @@ class FlowFrontend(Frontend):
         name: str,
         size_px: Sequence[int] | None,
         quantise: bool,
-        bound_px: float,
+        bound: float,
         cache: str | None,
         batch: int,
     ) -> None:
@@ -54,12 +54,12 @@ class FlowFrontend(Frontend):
         if size is not None:
             whole = len(size) == 2 and all(isinstance(side, int) and side >= SMALLEST_PX for side in size)
             require("size_px", size_px, whole, f"[width, height], whole numbers of at least {SMALLEST_PX}, or null")
-        require("bound_px", bound_px, bound_px > 0.0, "positive")
+        require("bound", bound, bound > 0.0, "positive")
         require("batch", batch, batch >= 1, "at least 1")
         self._name = name
         self._size = None if size is None else (size[0], size[1])
         self._quantise = quantise
-        self._bound_px = bound_px
+        self._bound = bound
         self._cache_folder = cache
         self._batch = batch
         self._cache: FlowCache | None = None
@@ -134,7 +134,7 @@ class FlowFrontend(Frontend):
         """The cache for what :meth:`settings` says now; None where there is none."""
         if self._cache_folder is None:
             return None
-        kept = f"levels of {self._bound_px!r} px" if self._quantise else "pixels"
+        kept = f"levels of {self._bound!r} of the width" if self._quantise else "pixels"
         return FlowCache(self._cache_folder, f"{self.settings()} {kept}")
 
     def _prepare(self, frame: Frame, camera: Camera) -> Image:
@@ -150,6 +150,7 @@ class FlowFrontend(Frontend):
     def _flows(self, chain: Sequence[Image]) -> list[Array]:
         """Flow px between each image of the chain and the next."""
         count = len(chain) - 1
+        bound_px = self._bound * chain[0].shape[1]
         kept: list[np.ndarray | None] = [None] * count
         keys: list[str] = []
         if self._cache is not None and count:
@@ -162,12 +163,12 @@ class FlowFrontend(Frontend):
             first = np.stack([chain[index] for index in missing])
             second = np.stack([chain[index + 1] for index in missing])
             for index, flow in zip(missing, self.solve(first, second), strict=True):
-                made = flow_to_levels(flow, self._bound_px) if self._quantise else flow
+                made = flow_to_levels(flow, bound_px) if self._quantise else flow
                 kept[index] = made
                 if self._cache is not None:
                     self._cache.store(keys[index], made)
         found = [flow for flow in kept if flow is not None]
-        return [levels_to_flow(flow, self._bound_px) for flow in found] if self._quantise else found
+        return [levels_to_flow(flow, bound_px) for flow in found] if self._quantise else found
 
     @abstractmethod
     def solve(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:

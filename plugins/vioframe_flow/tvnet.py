@@ -74,7 +74,7 @@ class TvnetFrontend(FlowFrontend):
         device: ``cpu``, ``cuda``, or ``auto`` for the latter where there is one.
         batch: most pairs solved at once by :meth:`process_many`.
         quantise: round flow to 256 levels.
-        bound_px: flow at the last of them.
+        bound: flow at the last of them, as a share of the image's width.
         cache: folder in which flows are kept, or None.
 
     Raises:
@@ -82,6 +82,8 @@ class TvnetFrontend(FlowFrontend):
     """
 
     context_pairs = 1
+    # Its first weights make it classical TV-L1.
+    needs_training = False
 
     def __init__(
         self,
@@ -103,10 +105,10 @@ class TvnetFrontend(FlowFrontend):
         device: str = "auto",
         batch: int = 4,
         quantise: bool = True,
-        bound_px: float = 48.0,
+        bound: float = 0.09375,
         cache: str | None = None,
     ) -> None:
-        super().__init__(name="tvnet", size_px=size_px, quantise=quantise, bound_px=bound_px, cache=cache, batch=batch)
+        super().__init__(name="tvnet", size_px=size_px, quantise=quantise, bound=bound, cache=cache, batch=batch)
         self._options = _NetOptions(
             dual_step=dual_step,
             data_weight=data_weight,
@@ -210,7 +212,7 @@ class TvnetFrontend(FlowFrontend):
 
         flow = self.net(*split_pairs(batch.images, self._size))
         if self._quantise:
-            step = self._bound_px / LEVELS_A_SIDE
+            step = self._bound * flow.shape[-1] / LEVELS_A_SIDE
             levels = (flow.detach() / step).round().clamp(-ZERO_LEVEL, LEVELS_A_SIDE)
             flow = flow + (levels * step - flow).detach()
         return {FLOW: flow.reshape(len(batch), batch.pairs, *flow.shape[1:])}

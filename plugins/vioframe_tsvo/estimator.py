@@ -165,6 +165,11 @@ class LearnedVO(VOEstimator):
         """Pairs of images in a row that one answer takes in training."""
 
     @property
+    def needs_training(self) -> bool:
+        """Without weights its motions are those of a random net."""
+        return self._options.weights is None
+
+    @property
     @abstractmethod
     def architecture(self) -> Mapping[str, str | int | float | bool]:
         """What a file of weights must agree with."""

@@ -43,7 +43,7 @@ class Tsvo(LearnedVO):
         stack: L, flows that end with the pair's own.
         size_px: (width, height) to which images and flows are brought.
         flow_size_px: (width, height) of the flows inside the backbone; None leaves ``size_px``.
-        flow_unit_px: flow that is 1 to the net.
+        flow_unit: flow that is 1 to the net, as a share of the width.
         gray: take images in grey, even where the camera has colour.
         width: factor on the channels of the spatial stream.
         hidden: neurons of the layer that joins the streams.
@@ -70,7 +70,7 @@ class Tsvo(LearnedVO):
         stack: int = 10,
         size_px: Sequence[int] = (512, 256),
         flow_size_px: Sequence[int] | None = None,
-        flow_unit_px: float = 48.0,
+        flow_unit: float = 0.09375,
         gray: bool = False,
         width: float = 1.0,
         hidden: int = 512,
@@ -99,7 +99,7 @@ class Tsvo(LearnedVO):
             weights=weights,
             device=device,
         )
-        check_positive("vo", stack=stack, flow_unit_px=flow_unit_px, width=width, hidden=hidden)
+        check_positive("vo", stack=stack, flow_unit=flow_unit, width=width, hidden=hidden)
         if not 0.0 <= dropout < 1.0:
             raise ConfigError(f"vo.dropout must be from 0 to below 1, got {dropout}")
         if flow_size_px is not None:
@@ -108,7 +108,8 @@ class Tsvo(LearnedVO):
         self._backbone = backbone
         self._stack = stack
         self._flow_size = None if flow_size_px is None else (flow_size_px[0], flow_size_px[1])
-        self._flow_unit_px = flow_unit_px
+        self._flow_unit = flow_unit
+        self._flow_unit_px = flow_unit * options.size[0]
         self._width, self._hidden, self._dropout, self._batch_norm = width, hidden, dropout, batch_norm
         self._flows: deque[Tensor] = deque(maxlen=stack)
         self._last_ns: int | None = None
@@ -129,7 +130,7 @@ class Tsvo(LearnedVO):
             "stack": self._stack,
             "flow_width_px": flow_width,
             "flow_height_px": flow_height,
-            "flow_unit_px": self._flow_unit_px,
+            "flow_unit": self._flow_unit,
             "width": self._width,
             "hidden": self._hidden,
             "batch_norm": self._batch_norm,
@@ -140,7 +141,7 @@ class Tsvo(LearnedVO):
         """Both streams; the backbone with its ImageNet file, unless trained weights come anyway.
 
         Raises:
-            ConfigError: an unknown backbone, or flows too small for it.
+            ConfigError: an unknown backbone.
             DataError: the ImageNet file cannot be used.
         """
         from vioframe_tsvo.net.two_stream import TwoStreamNet

@@ -63,11 +63,15 @@ class SequenceCache:
     def get(
         self, recording: Recording, source: str, progress: Callable[[int], None] = lambda done: None
     ) -> tuple[StoredSequence, str]:
-        """The stored recording, decoded now if it was not before, and the hash of its content.
+        """What :func:`read_stored` makes of :meth:`store`, with the errors of both."""
+        return read_stored(self.store(recording, source, progress))
+
+    def store(self, recording: Recording, source: str, progress: Callable[[int], None] = lambda done: None) -> Path:
+        """The folder of the stored recording, which is decoded now if it was not before.
 
         Args:
             recording: opened.
-            source: what it was opened from: the resolved configuration of its data set, as text.
+            source: what it was opened from: the resolved configuration of its data set, as text, less what names it.
             progress: told how many frames are done.
 
         Raises:
@@ -81,9 +85,7 @@ class SequenceCache:
         target = self._folder / f"{_clean(recording.name)}-{self._key(recording, source)[:16]}"
         if not (target / "manifest.json").exists():
             self._write(recording, target, progress)
-        sequence, content = _read(target)
-        progress(len(sequence))
-        return sequence, content
+        return target
 
     def _key(self, recording: Recording, source: str) -> str:
         truth = recording.ground_truth()
@@ -224,7 +226,12 @@ def resized_camera(camera: Camera, size_px: tuple[int, int]) -> Camera:
     return replace(camera, intrinsics_px=np.concatenate([focal, centre]), size_px=size_px)
 
 
-def _read(folder: Path) -> tuple[StoredSequence, str]:
+def read_stored(folder: Path) -> tuple[StoredSequence, str]:
+    """A stored recording, in the folder that :meth:`SequenceCache.store` returned, and the hash of its content.
+
+    Raises:
+        DataError: the folder is damaged.
+    """
     try:
         manifest: dict[str, Any] = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
         width, height = manifest["size_px"]

@@ -29,7 +29,8 @@ class TrainerOptions:
         max_minutes: stops after this time, at the end of a batch; None: no limit.
         batch_size: windows in a step, on each device.
         pairs: consecutive pairs of images in a window; None takes as many as the parts look back at.
-        size_px: (width, height) to which images are resized.
+        size_px: (width, height) to which images are resized; the parts take it from here.
+        flow_size_px, width: sizes of nets, which the parts take from here.
         channels: 1 (grey) or 3 (RGB).
         cache: folder of the decoded recordings.
         train: slots whose parts are trained, the others keep their weights; None trains all that can be.
@@ -60,6 +61,8 @@ class TrainerOptions:
     batch_size: int
     pairs: int | None
     size_px: Sequence[int]
+    flow_size_px: Sequence[int] | None
+    width: float
     channels: int
     cache: str
     train: Sequence[str] | None
@@ -94,7 +97,9 @@ class TrainerOptions:
                 raise ConfigError(f"trainer.{name} must be a whole number of 1 or more, got {value!r}")
         if self.max_minutes is not None:
             check_positive("trainer", max_minutes=self.max_minutes)
-        check_positive("trainer", learning_rate=self.learning_rate, divergence_factor=self.divergence_factor)
+        check_positive(
+            "trainer", width=self.width, learning_rate=self.learning_rate, divergence_factor=self.divergence_factor
+        )
         check_not_negative(
             "trainer", weight_decay=self.weight_decay, warmup_steps=self.warmup_steps, gradient_clip=self.gradient_clip
         )
@@ -109,6 +114,7 @@ class TrainerOptions:
         """All that has a bearing on the result, as plain values."""
         plain = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in _WITHOUT_BEARING}
         plain |= {name: list(plain[name]) for name in ("size_px", "segment_lengths_m")}
+        plain["flow_size_px"] = None if self.flow_size_px is None else list(self.flow_size_px)
         plain["train"] = None if self.train is None else list(self.train)
         plain["augmentation"] = self.augmentation.settings()
         return plain

@@ -22,6 +22,7 @@ from vioframe.pipeline import Pipeline
 from vioframe.sweep import write_status
 from vioframe.tasks.interruption import INTERRUPTED, terminate_like_interrupt
 from vioframe.tasks.progress import frame_progress
+from vioframe.tasks.provision import provide_weights, untrained_slots
 from vioframe.tasks.run_sequence import Recorder, run_sequence
 from vioframe.tracking import Tracker, metrics_of
 from vioframe.viewer import Viewer, build_viewer
@@ -38,7 +39,15 @@ def run(config: DictConfig) -> int:
     folder = Path(hydra_config.runtime.output_dir)
     choices = {group: str(option) for group, option in hydra_config.runtime.choices.items()}
     options = build_options(config)
+    in_sweep = hydra_config.mode == RunMode.MULTIRUN
     pipeline = build_pipeline(config, choices)
+    if slots := untrained_slots(pipeline):
+        with terminate_like_interrupt():
+            try:
+                provide_weights(config, choices, slots, shown=bool(config.progress) and not in_sweep)
+            except KeyboardInterrupt:
+                return INTERRUPTED
+        pipeline = build_pipeline(config, choices)
     dataset = build_dataset(config, choices.get("dataset", ""))
     tracker = build(config, "tracker", Tracker, choices.get("tracker", ""))
     viewer = build_viewer(config, choices)
@@ -52,7 +61,7 @@ def run(config: DictConfig) -> int:
     experiment = _Experiment(config, folder, options, pipeline, dataset, tracker, viewer, choices)
     with terminate_like_interrupt(), tracker:
         tracker.start(parameters, tags, name=_run_name(pipeline, choices))
-        status = experiment.run(in_sweep=hydra_config.mode == RunMode.MULTIRUN)
+        status = experiment.run(in_sweep=in_sweep)
         if status == INTERRUPTED:
             tracker.finish("killed", "interrupted by the user")
         elif status:

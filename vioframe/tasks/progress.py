@@ -1,4 +1,4 @@
-"""The progress bar of one sequence."""
+"""Progress bars: of the frames of one sequence, and of a share of some work."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -37,3 +37,32 @@ def frame_progress(name: str, frame_count: int, *, shown: bool) -> Iterator[Call
             bar.update(task, completed=done, rate="" if speed is None else f"{speed:.0f}/s")
 
         yield advance
+
+
+@contextmanager
+def share_progress(name: str, total: float, *, shown: bool) -> Iterator[Callable[[float], None]]:
+    """Yield a function that takes how much of ``total`` is done, and shows it in per cent on the terminal (stderr)."""
+    if not shown:
+        yield lambda done: None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), refresh_per_second=4) as bar:
+        task = bar.add_task(name, total=total)
+        yield lambda done: bar.update(task, completed=done)

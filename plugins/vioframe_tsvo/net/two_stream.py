@@ -71,7 +71,8 @@ class TwoStreamNet(nn.Module):
             backbone: googlenet, resnet50 or inceptionv3.
             backbone_weights: ImageNet file to start from, or None.
             flow_size_px: (width, height) to which the flows are resized for the backbone, such as (224, 224), for
-                which ImageNet's weights were made; None leaves their size.
+                which ImageNet's weights were made; None leaves their size. A side shorter than the backbone can take is
+                lengthened to that.
             width: factor on the channels of the spatial stream.
             hidden: neurons of the layer that joins the streams.
             dropout: before each of the two linear layers.
@@ -79,21 +80,17 @@ class TwoStreamNet(nn.Module):
             log_variances: answer with variances too.
 
         Raises:
-            ConfigError: a stack below 1, an unknown backbone, or a flow too small for it.
+            ConfigError: a stack below 1, or an unknown backbone.
             DataError: ``backbone_weights`` cannot be used.
         """
         super().__init__()
         if stack < 1:
             raise ConfigError(f"vo.stack must be at least 1, got {stack}")
-        self.size_px, self.stack, self.flow_size_px = size_px, stack, flow_size_px
+        self.size_px, self.stack = size_px, stack
         self.spatial = SpatialStream(size_px, width=width, batch_norm=batch_norm)
         self.temporal = make_backbone(backbone, 2 * stack, backbone_weights)
-        smallest = min(flow_size_px or size_px)
-        if smallest < self.temporal.smallest_px:
-            raise ConfigError(
-                f"backbone={backbone} needs flows of at least {self.temporal.smallest_px} px a side, got {smallest}: "
-                "choose larger images, vo.flow_size_px or another backbone"
-            )
+        width_px, height_px = flow_size_px or size_px
+        self.flow_size_px = max(width_px, self.temporal.smallest_px), max(height_px, self.temporal.smallest_px)
         self.join = nn.Sequential(
             nn.Dropout(dropout),
             nn.Linear(self.spatial.features + self.temporal.features, hidden),
@@ -117,7 +114,7 @@ class TwoStreamNet(nn.Module):
         """
         check_maps("images", pair, PAIR_CHANNELS, self.size_px)
         check_maps("flows", flow, 2 * self.stack, self.size_px)
-        if self.flow_size_px is not None and self.flow_size_px != self.size_px:
+        if self.flow_size_px != self.size_px:
             flow = nn.functional.interpolate(flow, size=self.flow_size_px[::-1], mode="bilinear", antialias=True)
         joined = torch.cat([self.spatial(centred(pair)), self.temporal(flow)], dim=1)
         estimate: MotionEstimate = self.head(self.join(joined))

@@ -40,7 +40,7 @@ def test_flows_are_told_apart_by_content_order_and_settings(tmp_path, rig_of, sl
         (sliding(96, 64, seed=1), {}),
         (frames, {"preset": "fast"}),
         (frames, {"quantise": False}),
-        (frames, {"bound_px": 20.0}),
+        (frames, {"bound": 0.2}),
         (frames, {"size_px": [64, 48]}),
     ]
     for others, options in cases:

@@ -60,7 +60,7 @@ def test_levels_only_round(make, rig_of, sliding) -> None:
     frames = sliding(96, 64)
     flows = []
     for quantise in (False, True):
-        frontend = make(quantise=quantise, bound_px=10.0)
+        frontend = make(quantise=quantise, bound=10.0 / 96)
         frontend.setup(rig_of(96, 64))
         flows.append(frontend.process_many(frames)[-1].flow)
     exact, rounded = flows
@@ -120,7 +120,7 @@ def test_what_cannot_be_used_is_said(make, rig_of, sliding) -> None:
 @pytest.mark.parametrize("make", BOTH)
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("size_px", [512]), ("size_px", [512, 8]), ("size_px", [51.2, 64]), ("bound_px", 0.0), ("bound_px", -1.0)],
+    [("size_px", [512]), ("size_px", [512, 8]), ("size_px", [51.2, 64]), ("bound", 0.0), ("bound", -1.0)],
 )
 def test_wrong_options_are_named(make, option: str, value: object) -> None:
     with pytest.raises(ConfigError, match=rf"frontend\.{option} must be"):

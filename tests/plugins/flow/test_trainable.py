@@ -43,7 +43,7 @@ def batch_of(*windows) -> WindowBatch:
 @pytest.mark.parametrize("quantise", [True, False])
 def test_streaming_equals_batch(quantise: bool, rig_of, sliding) -> None:
     windows = [sliding(64, 48, (2, 1), count=4), sliding(64, 48, (-3, 2), count=4, seed=1)]
-    part = tvnet(quantise=quantise, bound_px=16.0)
+    part = tvnet(quantise=quantise, bound=0.25)
     with torch.no_grad():
         flow = part.forward_batch(batch_of(*windows), {})["flow"]
     assert flow.shape == (2, 3, 2, 48, 64)

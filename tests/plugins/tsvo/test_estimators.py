@@ -284,8 +284,6 @@ def test_bad_options_are_refused(options, sentence):
 def test_bad_options_that_only_the_net_knows_are_refused_at_setup(scene):
     with pytest.raises(ConfigError, match="backbone.name must be one of googlenet, resnet50, inceptionv3, got 'vgg'"):
         tsvo(backbone=Backbone(name="vgg")).setup(scene.rig)
-    with pytest.raises(ConfigError, match="at least 75 px a side, got 64"):
-        tsvo(backbone=Backbone(name="inceptionv3"), flow_size_px=(64, 64)).setup(scene.rig)
     with pytest.raises(ConfigError, match="vo.window must be positive"):
         deepvo(window=0)
     with pytest.raises(ConfigError, match="vo.lstm_dropout must be from 0"):

@@ -20,6 +20,7 @@ class TinyVo(VOEstimator):
         from tiny_learned.net import TinyNet
 
         self._width = width
+        self.needs_training = weights is None
         self.net = TinyNet(width)
         if weights is not None:
             from vioframe.learning.weights import load_weights, locate_weights

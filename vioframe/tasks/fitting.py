@@ -1,0 +1,112 @@
+"""From a config to trained weights: the parts that have a net, how they are trained, and the record of it."""
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omegaconf import DictConfig, OmegaConf
+
+from vioframe.build import build, build_pipeline
+from vioframe.errors import ConfigError
+from vioframe.interfaces import Trainable
+from vioframe.tracking import Tracker
+
+if TYPE_CHECKING:
+    from vioframe.learning.options import TrainerOptions
+    from vioframe.learning.training import Split, Trained
+
+log = logging.getLogger(__name__)
+
+
+def trainer_options(config: DictConfig, choices: Mapping[str, str]) -> "TrainerOptions":
+    """The options of ``trainer=``.
+
+    Raises:
+        ConfigError: no trainer or no training data was chosen, or an option that cannot work.
+    """
+    from vioframe.learning.options import TrainerOptions
+
+    for group, example in (("trainer", "cpu"), ("training_data", "simulated_car")):
+        if not config.get(group):
+            raise ConfigError(f"{group}={choices.get(group, 'none')} does not say how to train: add {group}={example}")
+    return build(config, "trainer", TrainerOptions, choices.get("trainer", ""))
+
+
+def trainable_parts(config: DictConfig, choices: Mapping[str, str], seed: int) -> dict[str, Trainable]:
+    """The parts of ``config`` that have a net, by slot, in the order of the pipeline.
+
+    Args:
+        config: the whole.
+        choices: by group, for messages.
+        seed: of their first weights.
+
+    Raises:
+        ConfigError: there is none, or the parts do not fit together.
+    """
+    from vioframe.learning.seeding import seed_everything
+
+    seed_everything(seed)
+    filled = build_pipeline(config, choices).parts()
+    parts: dict[str, Trainable] = {slot: part for slot, part in filled.items() if isinstance(part, Trainable)}
+    if not parts:
+        told = ", ".join(f"{slot}={choices.get(slot, '')}" for slot in filled)
+        raise ConfigError(f"task=train has nothing to train: none of {told} has a net; choose a part that has one")
+    return parts
+
+
+def fit_parts(
+    parts: Mapping[str, Trainable],
+    splits: "tuple[Split, Split]",
+    options: "TrainerOptions",
+    *,
+    config: DictConfig,
+    choices: Mapping[str, str],
+    folder: Path,
+    tracker: Tracker,
+    shown: bool,
+) -> "Trained":
+    """Train ``parts`` in a record of its own, and tell what came out.
+
+    Args:
+        parts: by slot, as :func:`trainable_parts` returns them.
+        splits: training and validation, as :func:`read_splits` returns them.
+        options: of the training.
+        config: the whole, for the record and the card.
+        choices: by group.
+        folder: of weights, curve and resume file.
+        tracker: not started; whoever calls finishes it.
+        shown: whether to show a progress bar.
+
+    Raises:
+        ConfigError: an option that cannot work, or a learning rate that diverges.
+        DataError: recordings that are too short, or a resume file that does not fit.
+        KeyboardInterrupt: the user stopped it; weights and resume file are those of the last epoch.
+    """
+    # Lightning takes its seconds only now that the user's mistakes are told.
+    from vioframe.learning.training import train_parts
+
+    plain = OmegaConf.to_container(config, resolve=True)
+    parameters = {str(key): value for key, value in plain.items()} if isinstance(plain, dict) else {}
+    chosen = {slot: choices.get(slot, "none") for slot in parts}
+    about = {"parts": chosen, "config": {slot: parameters.get(slot) for slot in parts}}
+    tags = {"task": "train", "training_data": choices.get("training_data", ""), **chosen}
+    tracker.start(parameters, tags, name=f"train {' '.join(chosen.values())}")
+    trained = train_parts(parts, *splits, options, folder=folder, tracker=tracker, about=about, shown=shown)
+    if trained.score is not None:
+        log.info(
+            "best of %d epochs on the validation recordings: t_rel %.2f %%, r_rel %.2f °/100 m (constant motion: "
+            "%.2f %%, %.2f °/100 m; %d segments)",
+            trained.epochs,
+            trained.score.t_rel_percent,
+            trained.score.r_rel_deg_per_100m,
+            trained.constant.t_rel_percent,
+            trained.constant.r_rel_deg_per_100m,
+            trained.score.segments,
+        )
+    for path in trained.weights.values():
+        tracker.log_file(path, "weights")
+        tracker.log_file(path.with_suffix(".json"), "weights")
+    if (folder / "curve.csv").exists():
+        tracker.log_file(folder / "curve.csv")
+    return trained

@@ -1,0 +1,158 @@
+"""Weights for the parts of an experiment that have none: trained once, then found again by what they came from.
+
+What is trained lies in ``trainer.cache/trained/<parts>-<key>``. The key is a hash of all that has a bearing on it:
+the trainer's options, the configuration of the parts, the content of both splits and the version of this package.
+A training that was stopped goes on when the same command is given again.
+"""
+
+import hashlib
+import json
+import logging
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omegaconf import DictConfig, OmegaConf
+
+from vioframe import __version__
+from vioframe.build import build
+from vioframe.errors import ConfigError, DataError
+from vioframe.interfaces import Trainable
+from vioframe.learning import require_torch
+from vioframe.pipeline import SLOTS, Pipeline
+from vioframe.tasks.decoding import read_splits
+from vioframe.tasks.fitting import fit_parts, trainable_parts, trainer_options
+from vioframe.tracking import Tracker
+
+if TYPE_CHECKING:
+    from vioframe.learning.options import TrainerOptions
+    from vioframe.learning.training import Split
+
+log = logging.getLogger(__name__)
+
+_RESULT = "weights.json"
+
+
+def untrained_slots(pipeline: Pipeline) -> list[str]:
+    """Slots of the parts whose answers mean nothing before they are trained."""
+    filled = pipeline.parts()
+    return [slot for slot, part in filled.items() if isinstance(part, Trainable) and part.needs_training]
+
+
+def provide_weights(config: DictConfig, choices: Mapping[str, str], slots: list[str], *, shown: bool) -> None:
+    """Fill in ``<slot>.weights`` of the parts that have none, by training them or finding what was trained before.
+
+    Args:
+        config: the whole; changed in place.
+        choices: by group.
+        slots: of the parts that need training, as :func:`untrained_slots` returns them.
+        shown: whether to show progress bars.
+
+    Raises:
+        ConfigError: it is not said how to train, or the training cannot work or diverges.
+        DataError: recordings that cannot be learned from.
+        KeyboardInterrupt: the user stopped the training; it can go on.
+    """
+    told = " and ".join(f"{slot}={choices.get(slot, '')}" for slot in slots)
+    require_torch(f"training {told}", training=True)
+    try:
+        options = trainer_options(config, choices)
+    except ConfigError as error:
+        given = " ".join(f"{slot}.weights=FILE" for slot in slots)
+        raise ConfigError(f"{told} has no weights: give {given}, or have it trained first ({error})") from error
+    if options.devices > 1:
+        raise ConfigError(
+            f"trainer.devices={options.devices}: an experiment trains {told} in one process; train it with task=train "
+            "first, and give its weights"
+        )
+    splits = read_splits(config, options, choices, shown=shown)
+    # A part that was given its weights keeps them; one that works without, such as TVNet, is trained along.
+    chosen = options.train or [slot for slot in _slots_with_weights(config) if config[slot].weights is None]
+    options = replace(options, train=list(chosen))
+    key = _key(config, options, splits)
+    place = Path(options.cache).expanduser() / "trained" / f"{'-'.join(choices.get(s, s) for s in chosen)}-{key[:16]}"
+    found = _trained(place)
+    if not found:
+        from filelock import FileLock
+
+        place.mkdir(parents=True, exist_ok=True)
+        # Jobs of a sweep may want the same weights: the first trains, the others wait for it.
+        with FileLock(place / "lock"):
+            found = _trained(place) or _train(config, choices, options, splits, place, shown=shown)
+    else:
+        log.info("%s was trained before: %s", told, place)
+    for slot, name in found.items():
+        OmegaConf.update(config, f"{slot}.weights", str(place / name))
+
+
+def _slots_with_weights(config: DictConfig) -> list[str]:
+    return [slot for slot in SLOTS if isinstance(config.get(slot), DictConfig) and "weights" in config[slot]]
+
+
+def _key(config: DictConfig, options: "TrainerOptions", splits: "tuple[Split, Split]") -> str:
+    # All parts: those without a net may feed those with one. Where they compute and keep files changes nothing.
+    parts = {
+        slot: {name: value for name, value in config[slot].items() if name not in ("device", "cache")}
+        for slot in SLOTS
+        if isinstance(config.get(slot), DictConfig)
+    }
+    words = [__version__, options.settings(), parts, [split.hashes for split in splits]]
+    return hashlib.sha256(json.dumps(words, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _trained(place: Path) -> dict[str, str]:
+    """File names by slot of a training that ended, or nothing."""
+    try:
+        found: dict[str, str] = json.loads((place / _RESULT).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise DataError(
+            f"{place / _RESULT} is damaged ({error}): delete the folder, and it is trained again"
+        ) from error
+    return found if all((place / name).is_file() for name in found.values()) else {}
+
+
+def _train(
+    config: DictConfig,
+    choices: Mapping[str, str],
+    options: "TrainerOptions",
+    splits: "tuple[Split, Split]",
+    place: Path,
+    *,
+    shown: bool,
+) -> dict[str, str]:
+    resume = place / "resume.ckpt"
+    again = resume.is_file()
+    log.info("%s %s in %s", "going on to train" if again else "training", ", ".join(options.train or ()), place)
+    (place / "config.yaml").write_text(OmegaConf.to_yaml(config, resolve=True), encoding="utf-8")
+    parts = trainable_parts(config, choices, options.seed)
+    with build(config, "tracker", Tracker, choices.get("tracker", "")) as tracker:
+        try:
+            trained = fit_parts(
+                parts,
+                splits,
+                replace(options, resume=str(resume) if again else None),
+                config=config,
+                choices=choices,
+                folder=place,
+                tracker=tracker,
+                shown=shown,
+            )
+        except KeyboardInterrupt:
+            log.warning("training was interrupted; the same command goes on with it")
+            tracker.finish("killed", "interrupted by the user")
+            raise
+    if not trained.weights:
+        raise ConfigError(
+            f"trainer.max_minutes={options.max_minutes} ended the training before its first validation: give it more"
+        )
+    found = {slot: path.relative_to(place).as_posix() for slot, path in trained.weights.items()}
+    partial = place / f"{_RESULT}.partial"
+    partial.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    os.replace(partial, place / _RESULT)
+    # It is of no more use, and three times as large as the weights.
+    resume.unlink(missing_ok=True)
+    return found
