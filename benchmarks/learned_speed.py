@@ -71,6 +71,8 @@ def throughput(
         f"{' '.join([*chosen, *overrides])}\n{machine}, torch {torch.__version__}, net at {size_px[0]}×{size_px[1]} px"
     )
     figures = model_figures(pipeline.parts(), size_px)
+    if "vo.parameters" not in figures:
+        raise SystemExit("there is no net in the slot vo: choose one, as --set vo=deepvo")
     gmac = figures.get("vo.gmac", float("nan"))
     print(f"size: {figures['vo.parameters'] / 1e6:.2f} M parameters, {gmac:.3f} GMAC an image")
     peak = _peak_tflops(device, _DTYPES[precision])

@@ -3,11 +3,12 @@
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 from vioframe.sweep.chart import draw_chart
-from vioframe.sweep.curves import find_curves
+from vioframe.sweep.curves import draw_panel, find_curves
 from vioframe.sweep.jobs import JobResult
-from vioframe.sweep.summary import summarise
+from vioframe.sweep.summary import COLUMNS, summarise
 
 NETS = {
     "ate_se3_m": 2.0,
@@ -87,6 +88,27 @@ def test_lines_are_drawn_with_what_failed_left_out(tmp_path: Path, seeds: int) -
     assert find_curves(summarise(jobs)) is not None
     assert draw_chart(summarise(jobs), tmp_path / "sweep.png")
     assert (tmp_path / "sweep.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_seed_without_a_value_takes_the_point_away() -> None:
+    overrides = [(f"x={x}", f"seed={seed}") for x in (1, 2, 4) for seed in (0, 1, 2)]
+    jobs = [
+        JobResult(
+            number=number,
+            overrides=texts,
+            status="failed" if texts == ("x=4", "seed=2") else "finished",
+            metrics={} if texts == ("x=2", "seed=0") else {"ate_se3_m": float(number)},
+        )
+        for number, texts in enumerate(overrides)
+    ]
+    curves = find_curves(summarise(jobs))
+    assert curves is not None
+    axes = Figure().subplots()
+    draw_panel(axes, COLUMNS[0], curves)
+    line = axes.get_lines()[0]
+    assert list(line.get_xdata()) == [1.0, 4.0]
+    # One that failed is named below the chart, as the table says of how many seeds a median is.
+    assert list(line.get_ydata()) == [1.0, 6.5]
 
 
 def test_nets_are_compared_by_size_and_cost() -> None:

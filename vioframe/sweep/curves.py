@@ -81,7 +81,7 @@ def draw_curves(summary: Summary, columns: Sequence[Column], curves: Curves, pat
         figure = new_figure((3.5 * across + 0.3, 2.9 * down + 0.8))
         panels = figure.subplots(down, across, squeeze=False).flatten()
         for axes, column in zip(panels, columns, strict=False):
-            _draw_panel(axes, column, curves)
+            draw_panel(axes, column, curves)
         for axes in panels[len(columns) :]:
             axes.set_visible(False)
         # Below every column of panels, the last of which may be shorter.
@@ -98,15 +98,15 @@ def draw_curves(summary: Summary, columns: Sequence[Column], curves: Curves, pat
         figure.savefig(path)
 
 
-def _draw_panel(axes: "Axes", column: Column, curves: Curves) -> None:
+def draw_panel(axes: "Axes", column: Column, curves: Curves) -> None:
+    """Draw one metric: a line each; no point where a job that finished has no value."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
     numbers = sorted({number for line in curves.lines.values() for number in line})
     drawn: list[float] = []
     for place, (label, line) in enumerate(curves.lines.items()):
         colour, marker = _COLOURS[place], _MARKERS[place]
-        values = {number: _values(jobs, column) for number, jobs in line.items()}
-        known = {number: sorted(each) for number, each in values.items() if each}
+        known = {number: sorted(_values(jobs, column)) for number, jobs in line.items() if _is_known(jobs, column)}
         drawn += [value for each in known.values() for value in each]
         x = list(known)
         middle = [median(each) for each in known.values()]
@@ -130,6 +130,12 @@ def _draw_panel(axes: "Axes", column: Column, curves: Curves) -> None:
         axes.xaxis.set_major_locator(FixedLocator(numbers))
         axes.xaxis.set_minor_locator(NullLocator())
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def _is_known(jobs: Sequence[JobResult], column: Column) -> bool:
+    """Whether all that finished have a value: a seed without one must not drop out of the median unseen."""
+    finished = [job for job in jobs if job.status == "finished"]
+    return bool(finished) and all(column.key in job.metrics for job in finished)
 
 
 def _values(jobs: Sequence[JobResult], column: Column) -> list[float]:
