@@ -6,7 +6,7 @@ begin: nowhere across a missing image or where the truth is unknown. Splits are 
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -184,19 +184,24 @@ class WindowIndex:
         recording = int(self._recording[index])
         return cut_window(self.sequences[recording], int(self._start[index]), self.pairs, recording)
 
+    @property
+    def shortest_run(self) -> int:
+        """Pairs of images of the shortest unbroken run that holds a window."""
+        return min(len(run) for run in self._runs()) + self.pairs - 1
+
+    def _runs(self) -> Iterator[np.ndarray]:
+        """Numbers of the windows of each unbroken run of images."""
+        for recording in range(len(self.sequences)):
+            members = np.flatnonzero(self._recording == recording)
+            runs = np.split(members, np.flatnonzero(np.diff(self._start[members]) != 1) + 1)
+            yield from (run for run in runs if len(run))
+
     def tiled(self, advance: int) -> Self:
         """The windows that cover each unbroken run of images once, when each answers for its last ``advance`` pairs.
 
         The last window of a run is moved back so that it ends with it; what it answers again is the same.
         """
-        kept: list[int] = []
-        for recording in range(len(self.sequences)):
-            members = np.flatnonzero(self._recording == recording)
-            starts = self._start[members]
-            for run in np.split(np.arange(len(starts)), np.flatnonzero(np.diff(starts) != 1) + 1):
-                if len(run):
-                    chosen = [*run[:-1:advance], run[-1]]
-                    kept += [int(members[number]) for number in chosen]
+        kept = [int(number) for run in self._runs() for number in (*run[:-1:advance], run[-1])]
         other = object.__new__(type(self))
         other.sequences, other.pairs = self.sequences, self.pairs
         other._recording, other._start = self._recording[kept], self._start[kept]

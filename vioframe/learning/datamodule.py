@@ -132,22 +132,24 @@ class WindowData(lightning.LightningDataModule):
         sampler = EpochSampler(
             len(self._training), drawn=self._epoch_windows, seed=self._seed, shuffle=True, rank=rank, world=world
         )
-        return self._loader(WindowDataset(self._training, self._augmentation, self._seed), sampler)
+        return self._loader(WindowDataset(self._training, self._augmentation, self._seed), sampler, self._batch_size)
 
     def val_dataloader(self) -> DataLoader[TrainingWindow]:
         """In order; every process sees all of it, so that each knows the whole trajectories."""
         sampler = EpochSampler(len(self._validation), drawn=None, seed=0, shuffle=False)
-        return self._loader(WindowDataset(self._validation, None, 0), sampler)
+        # Its windows may be longer, and what is in memory at once should not be more for it.
+        further = max(self._validation.pairs - self._training.pairs, 0)
+        return self._loader(WindowDataset(self._validation, None, 0), sampler, -(-self._batch_size // (1 + further)))
 
     def transfer_batch_to_device(self, batch: WindowBatch, device: torch.device, dataloader_idx: int) -> WindowBatch:
         """Move bytes, then make them numbers between 0 and 1 there."""
         return batch.to(device, non_blocking=True).as_float()
 
-    def _loader(self, dataset: WindowDataset, sampler: EpochSampler) -> DataLoader[TrainingWindow]:
+    def _loader(self, dataset: WindowDataset, sampler: EpochSampler, batch_size: int) -> DataLoader[TrainingWindow]:
         helped = self._workers > 0
         return DataLoader(
             dataset,
-            batch_size=min(self._batch_size, len(sampler)),
+            batch_size=min(batch_size, len(sampler)),
             sampler=sampler,
             collate_fn=collate,
             num_workers=self._workers,

@@ -30,7 +30,7 @@ class TrainerOptions:
         batch_size: windows in a step, on each device.
         pairs: consecutive pairs of images in a window; None takes as many as the parts look back at.
         size_px: (width, height) to which images are resized; the parts take it from here.
-        flow_size_px, width: sizes of nets, which the parts take from here.
+        flow_size_px, width, dropout: of nets; only recorded here, the parts take them from here.
         channels: 1 (grey) or 3 (RGB).
         cache: folder of the decoded recordings.
         train: slots whose parts are trained, the others keep their weights; None trains all that can be.
@@ -63,6 +63,7 @@ class TrainerOptions:
     size_px: Sequence[int]
     flow_size_px: Sequence[int] | None
     width: float
+    dropout: float
     channels: int
     cache: str
     train: Sequence[str] | None

@@ -45,6 +45,9 @@ from vioframe.tracking import Tracker
 
 log = logging.getLogger(__name__)
 
+# Pairs by which windows of validation are longer than those of training.
+_FURTHER_PAIRS = 7
+
 _PROTOCOL = (
     "trajectory of camera 0, causal, no alignment; mean over segments of the given lengths; validation recordings, "
     "which also chose these weights"
@@ -118,13 +121,13 @@ def train_parts(
     pairs = options.pairs or max(part.context_pairs for part in parts.values())
     context = max(part.context_pairs for part in parts.values())
     train_index = WindowIndex(training.sequences, max(pairs, context), split="training")
-    validation_index = WindowIndex(validation.sequences, max(pairs, context), split="validation")
+    validation_index = _validation_windows(validation.sequences, max(pairs, context))
     constant = _constant_score(training, validation, options)
     seed_everything(options.seed)
     module = TrainingModule(parts, options, validation.sequences, constant)
     data = WindowData(
         train_index,
-        validation_index.tiled(max(pairs, context) - context + 1),
+        validation_index.tiled(validation_index.pairs - context + 1),
         augmentation=options.augmentation,
         batch_size=options.batch_size,
         epoch_windows=options.epoch_windows,
@@ -145,6 +148,13 @@ def train_parts(
     trainer = _trainer(options, folder, watchers)
     _fit(trainer, module, data, options)
     return _result(best, curve, trained, constant)
+
+
+def _validation_windows(sequences: Sequence[StoredSequence], pairs: int) -> WindowIndex:
+    """Longer than in training, where no run of images is too short for it: what answers share is then found once."""
+    index = WindowIndex(sequences, pairs, split="validation")
+    longer = min(pairs + _FURTHER_PAIRS, index.shortest_run)
+    return index if longer == pairs else WindowIndex(sequences, longer, split="validation")
 
 
 def _constant_score(training: Split, validation: Split, options: TrainerOptions) -> Score:

@@ -18,6 +18,7 @@ from vioframe.evaluation.report import write_outputs
 from vioframe.evaluation.rows import evaluate_run, metrics_document
 from vioframe.evaluation.run import SequenceRun
 from vioframe.evaluation.table import print_rows
+from vioframe.learning.figures import model_figures
 from vioframe.pipeline import Pipeline
 from vioframe.sweep import write_status
 from vioframe.tasks.interruption import INTERRUPTED, terminate_like_interrupt
@@ -105,6 +106,7 @@ class _Experiment:
         self.rows: list[dict[str, object]] = []
         self._recorders: list[Recorder] = []
         self._bug: BaseException | None = None
+        self._model = model_figures(pipeline.parts())
 
     def failures(self) -> list[str]:
         """One sentence for each sequence that did not finish."""
@@ -169,7 +171,11 @@ class _Experiment:
         (self.folder / "metrics.json").write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
 
     def _about(self) -> dict[str, object]:
-        return {"vioframe": __version__, "parts": {slot: self.choices.get(slot, "none") for slot in self.choices}}
+        about: dict[str, object] = {
+            "vioframe": __version__,
+            "parts": {slot: self.choices.get(slot, "none") for slot in self.choices},
+        }
+        return {**about, "model": self._model} if self._model else about
 
     def _finish(self) -> None:
         document = write_outputs(

@@ -34,6 +34,9 @@ log = logging.getLogger(__name__)
 
 Outcome = Literal["ran", "refused", "crashed"]
 
+# Groups of plugins whose options are no parts of a pipeline, or choose several.
+_NO_PARTS = {"dataset", "viewer", "system", "experiment", "trainer", "training_data"}
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Combination:
@@ -97,7 +100,7 @@ def enumerate_variations(results: Sequence[Combination]) -> Iterator[dict[str, s
             if rig != "stereo":
                 yield {**choices, "rig": rig}
         config = compose("config", overrides=[*(f"{slot}={name}" for slot, name in choices.items())])
-        for group in _plugin_groups() - set(SLOTS) - {"dataset", "viewer"}:
+        for group in _plugin_groups() - set(SLOTS) - _NO_PARTS:
             if group in config:
                 yield from ({**choices, group: name} for name in _offered(group) if name != "none")
 
