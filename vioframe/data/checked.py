@@ -6,7 +6,7 @@ import numpy as np
 
 from vioframe.checks import Stamps
 from vioframe.conventions import seconds
-from vioframe.data.recording import Finding, Recording
+from vioframe.data.recording import CORRUPT_IMAGES, Finding, Recording
 from vioframe.types import Camera, Image, ImuBlock, SensorRig, Trajectory
 
 BLOCK_NS = 50_000_000
@@ -73,7 +73,7 @@ class CheckedRecording(Recording):
 
     def counters(self) -> Mapping[str, int]:
         """Images that could not be decoded since :meth:`packets` began."""
-        return {"corrupt images": self._corrupt} if self._corrupt else {}
+        return {CORRUPT_IMAGES: self._corrupt} if self._corrupt else {}
 
     def _blocks(self, start: int, end: int) -> Iterator[ImuBlock]:
         """Samples [start, end) in blocks of at most :data:`BLOCK_NS`."""

@@ -9,6 +9,9 @@ from typing import Literal
 
 from vioframe.types import Packet, SensorRig, Trajectory
 
+CORRUPT_IMAGES = "corrupt images"
+"""Counted by recordings whose images may turn out to be damaged, or of another size than calibrated."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:

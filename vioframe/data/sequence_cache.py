@@ -10,6 +10,7 @@ card cites.
 import errno
 import hashlib
 import json
+import logging
 import os
 import shutil
 import tempfile
@@ -24,17 +25,21 @@ import numpy as np
 
 from vioframe import __version__
 from vioframe.checks import Array, Mask, Stamps
-from vioframe.data.recording import Recording
+from vioframe.data.recording import CORRUPT_IMAGES, Recording
 from vioframe.data.windows import StoredSequence
 from vioframe.errors import ConfigError, DataError, VioframeError
 from vioframe.geometry.interpolation import interpolate_poses
 from vioframe.types import Camera, Frame, Image, ImuBlock
+
+log = logging.getLogger(__name__)
 
 _FORMAT = 1
 # Frames whose pixels are part of the key: enough to notice that a folder's images were exchanged.
 _FRAMES_IN_KEY = 3
 # Truth between poses further apart than this is not invented (as in evaluation.max_gap_s).
 _MAX_TRUTH_GAP_NS = 110_000_000
+# Share of a recording's images that may be unusable: a damaged file or two, not a folder of another camera.
+_MOST_LOST = 0.05
 # What a file system needs beside the bytes of the arrays.
 _RESERVE = 1.02
 
@@ -164,6 +169,7 @@ class SequenceCache:
                 digest.update(pixels)
                 stamps.append(packet.stamp_ns + recording.rig.camera_delay_ns)
                 progress(len(stamps))
+        _check_losses(recording, len(stamps))
         if len(stamps) < 2:
             raise DataError(
                 f"{recording.name} has {len(stamps)} image{'' if len(stamps) == 1 else 's'}, but a motion takes two: "
@@ -260,6 +266,16 @@ def read_stored(folder: Path) -> tuple[StoredSequence, str]:
         return sequence, str(manifest["sha256"])
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, VioframeError) as error:
         raise DataError(f"{folder} is damaged ({error}): delete it, and it is made again") from error
+
+
+def _check_losses(recording: Recording, stored: int) -> None:
+    """Refuse a recording of which many images could not be used, and tell of fewer."""
+    lost = recording.counters().get(CORRUPT_IMAGES, 0)
+    text = f"{recording.name}: {lost} of {lost + stored} images are damaged or of another size than calibrated"
+    if lost > _MOST_LOST * (lost + stored):
+        raise DataError(f"{text}: fetch them again, take the calibration of these images, or leave the recording out")
+    if lost:
+        log.warning("%s; they are left out of training", text)
 
 
 def _frames(recording: Recording) -> Iterator[Frame]:

@@ -77,6 +77,22 @@ def test_images_of_mixed_sizes_are_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_few_damaged_images_are_told_and_many_are_refused(tmp_path, monkeypatch, caplog):
+    recording = SceneRecording()
+    cache = SequenceCache(tmp_path, size_px=(64, 48), channels=1)
+    count = len(recording.frames)
+    monkeypatch.setattr(type(recording), "counters", lambda self: {"corrupt images": count})
+    with pytest.raises(
+        DataError, match=rf"{count} of {2 * count} images are damaged or of another size.*leave the rec"
+    ):
+        cache.get(recording, "scene")
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr(type(recording), "counters", lambda self: {"corrupt images": 1})
+    monkeypatch.setattr("vioframe.data.sequence_cache._MOST_LOST", 1.0 / count)
+    cache.get(recording, "scene")
+    assert f"1 of {count + 1} images are damaged" in caplog.text
+
+
 def test_no_space_is_told_before_anything_is_decoded(tmp_path, monkeypatch):
     usage = namedtuple("usage", "total used free")(10**9, 10**9, 1000)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
