@@ -168,8 +168,13 @@ def _constant_score(training: Split, validation: Split, options: TrainerOptions)
     )
 
 
+def has_gpu() -> bool:
+    """Whether torch can use one here."""
+    return torch.cuda.is_available()
+
+
 def _trainer(options: TrainerOptions, folder: Path, callbacks: list[Callback]) -> lightning.Trainer:
-    gpu = options.accelerator != "cpu" and torch.cuda.is_available()
+    gpu = options.accelerator != "cpu" and has_gpu()
     precision: Any = {"32": "32-true", "bf16": "bf16-mixed", "16": "16-mixed"}.get(str(options.precision), "32-true")
     if options.precision == "auto" and gpu and torch.cuda.is_bf16_supported():
         precision = "bf16-mixed"

@@ -84,8 +84,10 @@ def fit_parts(
         KeyboardInterrupt: the user stopped it; weights and resume file are those of the last epoch.
     """
     # Lightning takes its seconds only now that the user's mistakes are told.
-    from vioframe.learning.training import train_parts
+    from vioframe.learning.training import has_gpu, train_parts
 
+    if options.accelerator == "cpu" and has_gpu():
+        log.info("trainer=%s leaves the GPU of this machine idle; trainer=default uses it", choices.get("trainer", ""))
     plain = OmegaConf.to_container(config, resolve=True)
     parameters = {str(key): value for key, value in plain.items()} if isinstance(plain, dict) else {}
     chosen = {slot: choices.get(slot, "none") for slot in parts}
