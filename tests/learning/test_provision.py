@@ -9,7 +9,8 @@ pytest.importorskip("torch", reason="needs the extra learn")
 pytest.importorskip("lightning", reason="needs the extra learn")
 
 from composing import composed
-from vioframe.build import build_pipeline
+from vioframe.build import build, build_pipeline
+from vioframe.data.recording import Dataset
 from vioframe.errors import ConfigError
 from vioframe.learning.training import train_parts
 from vioframe.tasks.provision import provide_weights, untrained_slots
@@ -44,7 +45,7 @@ def provided(tmp_path, *overrides):
     config = composed(*SMALL, f"trainer.cache={tmp_path}", *overrides)
     slots = untrained_slots(build_pipeline(config, CHOICES))
     assert slots == ["vo"]
-    provide_weights(config, CHOICES, slots, shown=False)
+    provide_weights(config, CHOICES, slots, build(config, "dataset", Dataset), shown=False)
     return config
 
 
@@ -89,10 +90,17 @@ def test_an_interrupted_training_goes_on_with_the_same_command(tmp_path, trainin
 def test_what_cannot_be_trained_is_told(tmp_path):
     config = composed("system=deepvo", "trainer=none", "vo.size_px=[64,32]", "vo.width=0.03")
     with pytest.raises(ConfigError, match=r"vo=deepvo has no weights: give vo.weights=FILE, .* add trainer=cpu"):
-        provide_weights(config, {"vo": "deepvo"}, ["vo"], shown=False)
+        provide_weights(config, {"vo": "deepvo"}, ["vo"], build(config, "dataset", Dataset), shown=False)
     config = composed(*SMALL, "trainer.devices=2")
     with pytest.raises(ConfigError, match="trainer.devices=2: an experiment trains vo=deepvo in one process"):
-        provide_weights(config, CHOICES, ["vo"], shown=False)
+        provide_weights(config, CHOICES, ["vo"], build(config, "dataset", Dataset), shown=False)
+
+
+def test_recordings_that_are_learned_from_and_tested_on_are_told(tmp_path, caplog):
+    provided(tmp_path)
+    assert "tested on" not in caplog.text
+    provided(tmp_path, "dataset.split=train", "dataset.seed=[0,1]")
+    assert "car-20000 is learned from and tested on" in caplog.text
 
 
 def test_an_experiment_trains_evaluates_and_tells_what_its_net_weighs(tmp_path, cli):

@@ -19,7 +19,7 @@ from vioframe.evaluation.rows import evaluate_run, metrics_document
 from vioframe.evaluation.run import SequenceRun
 from vioframe.evaluation.table import print_rows
 from vioframe.learning.figures import model_figures
-from vioframe.pipeline import Pipeline
+from vioframe.pipeline import Pipeline, check_rig
 from vioframe.sweep import write_status
 from vioframe.tasks.interruption import INTERRUPTED, terminate_like_interrupt
 from vioframe.tasks.progress import frame_progress
@@ -42,14 +42,16 @@ def run(config: DictConfig) -> int:
     options = build_options(config)
     in_sweep = hydra_config.mode == RunMode.MULTIRUN
     pipeline = build_pipeline(config, choices)
+    dataset = build_dataset(config, choices.get("dataset", ""))
     if slots := untrained_slots(pipeline):
+        # What the recordings would have refused is refused before the time of a training is spent.
+        check_rig(pipeline.parts(), dataset.open(dataset.sequences[0]).rig, choices)
         with terminate_like_interrupt():
             try:
-                provide_weights(config, choices, slots, shown=bool(config.progress) and not in_sweep)
+                provide_weights(config, choices, slots, dataset, shown=bool(config.progress) and not in_sweep)
             except KeyboardInterrupt:
                 return INTERRUPTED
         pipeline = build_pipeline(config, choices)
-    dataset = build_dataset(config, choices.get("dataset", ""))
     tracker = build(config, "tracker", Tracker, choices.get("tracker", ""))
     viewer = build_viewer(config, choices)
     resolved = OmegaConf.to_yaml(config, resolve=True)

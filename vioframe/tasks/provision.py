@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from vioframe import __version__
 from vioframe.build import build
+from vioframe.data.recording import Dataset
 from vioframe.errors import ConfigError, DataError
 from vioframe.interfaces import Trainable
 from vioframe.learning import require_torch
@@ -41,13 +42,16 @@ def untrained_slots(pipeline: Pipeline) -> list[str]:
     return [slot for slot, part in filled.items() if isinstance(part, Trainable) and part.needs_training]
 
 
-def provide_weights(config: DictConfig, choices: Mapping[str, str], slots: list[str], *, shown: bool) -> None:
+def provide_weights(
+    config: DictConfig, choices: Mapping[str, str], slots: list[str], tested: Dataset, *, shown: bool
+) -> None:
     """Fill in ``<slot>.weights`` of the parts that have none, by training them or finding what was trained before.
 
     Args:
         config: the whole; changed in place.
         choices: by group.
         slots: of the parts that need training, as :func:`untrained_slots` returns them.
+        tested: what the experiment will run on.
         shown: whether to show progress bars.
 
     Raises:
@@ -68,6 +72,7 @@ def provide_weights(config: DictConfig, choices: Mapping[str, str], slots: list[
             "first, and give its weights"
         )
     splits = read_splits(config, options, choices, shown=shown)
+    _warn_of_leak(splits, tested)
     # A part that was given its weights keeps them; one that works without, such as TVNet, is trained along.
     chosen = options.train or [slot for slot in _slots_with_weights(config) if config[slot].weights is None]
     options = replace(options, train=list(chosen))
@@ -85,6 +90,15 @@ def provide_weights(config: DictConfig, choices: Mapping[str, str], slots: list[
         log.info("%s was trained before: %s", told, place)
     for slot, name in found.items():
         OmegaConf.update(config, f"{slot}.weights", str(place / name))
+
+
+def _warn_of_leak(splits: "tuple[Split, Split]", tested: Dataset) -> None:
+    """Tell of recordings that are learned from, or that choose weights, and tested on as well."""
+    # A stretch of a recording is called 06.0-90, the whole 06.
+    learned = {sequence.name.partition(".")[0] for split in splits for sequence in split.sequences}
+    both = sorted(name for name in tested.sequences if name.partition(".")[0] in learned)
+    if both:
+        log.warning("%s is learned from and tested on: these figures are not those of unseen data", ", ".join(both))
 
 
 def _slots_with_weights(config: DictConfig) -> list[str]:
