@@ -21,7 +21,7 @@ from vioframe_flow.frontend import FlowFrontend
 FAMILIES = {"car": 1, "walk": 2, "drone": 2}
 SHARES = (0.5, 0.65, 0.8, 0.95)
 GROSS_PX = 3.0
-EQUAL = {"warps": 5, "iterations": 5, "coupling": 0.3, "max_scales": 5, "smoothing_px": 0.0}
+EQUAL = {"warps": 5, "iterations": 5, "coupling": 0.3, "max_scales": 5, "smoothing_px": 0.0, "trust_outside": True}
 
 Pair = tuple[SensorRig, list[Frame], np.ndarray, np.ndarray]
 

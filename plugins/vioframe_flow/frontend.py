@@ -128,7 +128,7 @@ class FlowFrontend(Frontend):
             DataError: the cache has no space.
         """
         self._cache = self._open_cache()
-        return np.stack([self._flows([self._resize(to_gray(image)) for image in window]) for window in images])
+        return np.stack([self._flows([to_gray(self._resize(image)) for image in window]) for window in images])
 
     def _open_cache(self) -> FlowCache | None:
         """The cache for what :meth:`settings` says now; None where there is none."""
@@ -138,13 +138,15 @@ class FlowFrontend(Frontend):
         return FlowCache(self._cache_folder, f"{self.settings()} {kept}")
 
     def _prepare(self, frame: Frame, camera: Camera) -> Image:
-        return self._resize(gray_image(frame, 0, camera, self._name))
+        gray_image(frame, 0, camera, self._name)  # refuses what does not fit the calibration
+        # Made grey after it is resized, as a training does, which keeps resized colour.
+        return to_gray(self._resize(frame.images[0]))
 
-    def _resize(self, gray: Image) -> Image:
-        if self._size is None or gray.shape[::-1] == self._size:
-            return gray
+    def _resize(self, image: Image) -> Image:
+        if self._size is None or image.shape[1::-1] == self._size:
+            return image
         # Averages areas where the image shrinks, which leaves nothing to alias.
-        resized: Image = cv2.resize(gray, self._size, interpolation=cv2.INTER_AREA)
+        resized: Image = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)
         return resized
 
     def _flows(self, chain: Sequence[Image]) -> list[Array]:

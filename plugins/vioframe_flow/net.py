@@ -169,16 +169,22 @@ def photometric_loss(first: Tensor, second: Tensor, flow: Tensor, data_weight: f
 
 
 def split_pairs(images: Tensor, size_px: tuple[int, int] | None) -> tuple[Tensor, Tensor]:
-    """First and second images (B·S, C, H, W) of all pairs of consecutive images.
+    """First and second images (B·S, 1, H, W) of all pairs of consecutive images, grey, in single precision.
 
     Args:
         images: (B, S + 1, C, H, W).
         size_px: (width, height) to which they are brought; None, or the size they have, leaves them as they are.
     """
     batch, count = images.shape[:2]
+    images = images.float()
     if size_px is not None and images.shape[-2:] != size_px[::-1]:
         images = _resize(images.flatten(0, 1), size_px[::-1])
         images = images.reshape(batch, count, *images.shape[1:])
+    if images.shape[2] == len(_LUMA):
+        # In whole levels, as streaming has grey images; gradients pass unchanged.
+        grey = _grey(images.flatten(0, 1))
+        grey = grey + ((255.0 * grey).round() / 255.0 - grey).detach()
+        images = grey.reshape(batch, count, *grey.shape[1:])
     return images[:, :-1].flatten(0, 1), images[:, 1:].flatten(0, 1)
 
 

@@ -208,9 +208,13 @@ class TvnetFrontend(FlowFrontend):
             from vioframe_flow.batches import flow_of_batch
 
             return {FLOW: flow_of_batch(self, batch)}
+        import torch
+
         from vioframe_flow.net import split_pairs
 
-        flow = self.net(*split_pairs(batch.images, self._size))
+        # Half precision has one grey level in eight digits, too few for slopes.
+        with torch.autocast(batch.images.device.type, enabled=False):
+            flow = self.net(*split_pairs(batch.images, self._size))
         if self._quantise:
             step = self._bound * flow.shape[-1] / LEVELS_A_SIDE
             levels = (flow.detach() / step).round().clamp(-ZERO_LEVEL, LEVELS_A_SIDE)
@@ -221,8 +225,11 @@ class TvnetFrontend(FlowFrontend):
         """The energy of TV-L1, λ mean|I₂(x + u) − I₁| + mean(|∇u₁| + |∇u₂|); empty unless ``own_loss``."""
         if not self._own_loss:
             return {}
+        import torch
+
         from vioframe_flow.net import photometric_loss, split_pairs
 
-        first, second = self.net.prepare(*split_pairs(batch.images, self._size))
-        # The weight of the energy stays what it was: a learned one would make itself small.
-        return {"loss": photometric_loss(first, second, outputs[FLOW].flatten(0, 1), self._options.data_weight)}
+        with torch.autocast(batch.images.device.type, enabled=False):
+            first, second = self.net.prepare(*split_pairs(batch.images, self._size))
+            # The weight of the energy stays what it was: a learned one would make itself small.
+            return {"loss": photometric_loss(first, second, outputs[FLOW].flatten(0, 1), self._options.data_weight)}

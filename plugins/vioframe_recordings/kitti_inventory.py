@@ -102,6 +102,9 @@ class Inventory:
                 yield "rig=mono ", replace(self, cameras=1)
         if self.imu:
             yield "dataset.imu=none ", replace(self, imu=False)
+            if self.images:
+                color = f"dataset.color={str(not self.color).lower()} "
+                yield f"{color}dataset.imu=none ", replace(self, color=not self.color, imu=False)
         if self.images:
             yield "dataset.images=false ", replace(self, images=False)
 

@@ -31,6 +31,8 @@ _CHOICES = {
     "loss": ("learned", "fixed", "likelihood"),
     "device": ("auto", "cpu", "cuda"),
 }
+# In units of the output.
+_LARGEST_LOG_VARIANCE = 12.0
 # What OpenCV weighs red, green and blue with (ITU-R BT.601).
 _GRAY = (0.299, 0.587, 0.114)
 
@@ -300,7 +302,9 @@ class LearnedVO(VOEstimator):
         units = estimate.vector.new_tensor(unit)
         if estimate.log_variances is None:
             return estimate.vector * units, None
-        return estimate.vector * units, estimate.log_variances + 2.0 * units.log()
+        # One sample known to 2.5 thousandths of a unit must not outweigh all others; what is stated is what was taught.
+        limited = estimate.log_variances.clamp(-_LARGEST_LOG_VARIANCE, _LARGEST_LOG_VARIANCE)
+        return estimate.vector * units, limited + 2.0 * units.log()
 
     def _device(self) -> "torch.device":
         import torch

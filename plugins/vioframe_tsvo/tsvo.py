@@ -174,7 +174,9 @@ class Tsvo(LearnedVO):
         from vioframe_tsvo.net.two_stream import MotionEstimate, stack_flows
 
         if FLOW not in upstream:
-            raise ConfigError("vo=tsvo learns from flow, which no part before it computes here: use frontend=tvnet")
+            raise ConfigError(
+                "vo=tsvo learns from flow, which no part before it computes here: use frontend=dis or frontend=tvnet"
+            )
         if batch.pairs < self._stack:
             raise DataError(f"windows have {batch.pairs} pairs of images, but vo.stack={self._stack} needs as many")
         self.check_training_size("frontend.size_px", upstream[FLOW])

@@ -13,7 +13,7 @@ from vioframe.build import build, build_pipeline
 from vioframe.data.recording import Dataset
 from vioframe.errors import ConfigError
 from vioframe.learning.training import train_parts
-from vioframe.tasks.provision import provide_weights, untrained_slots
+from vioframe.tasks.provision import _bearing, provide_weights, untrained_slots
 from vioframe.tracking import NullTracker
 
 SMALL = [
@@ -43,16 +43,16 @@ def trainings(monkeypatch):
 
 def provided(tmp_path, *overrides):
     config = composed(*SMALL, f"trainer.cache={tmp_path}", *overrides)
-    slots = untrained_slots(build_pipeline(config, CHOICES))
-    assert slots == ["vo"]
-    provide_weights(config, CHOICES, slots, build(config, "dataset", Dataset), shown=False)
+    pipeline = build_pipeline(config, CHOICES)
+    assert untrained_slots(pipeline) == ["vo"]
+    provide_weights(config, CHOICES, pipeline, build(config, "dataset", Dataset), shown=False)
     return config
 
 
 def test_weights_are_trained_once_and_found_again_by_what_they_came_from(tmp_path, trainings):
     first = provided(tmp_path)
     assert untrained_slots(build_pipeline(first, CHOICES)) == []
-    assert provided(tmp_path, "vo.device=cpu", "dataset.seed=7", "trainer.workers=1").vo.weights == first.vo.weights
+    assert provided(tmp_path, "vo.device=cpu", "dataset.seed=7", "synchronizer=nearest").vo.weights == first.vo.weights
     assert len(trainings) == 1
     # All of these have a bearing on the weights.
     others = [["trainer.seed=1"], ["vo.loss=fixed"], ["training_data.train.seed=1"]]
@@ -87,13 +87,34 @@ def test_an_interrupted_training_goes_on_with_the_same_command(tmp_path, trainin
     assert curves[1] == pytest.approx(curves[0], rel=1e-5)
 
 
-def test_what_cannot_be_trained_is_told(tmp_path):
-    config = composed("system=deepvo", "trainer=none", "vo.size_px=[64,32]", "vo.width=0.03")
-    with pytest.raises(ConfigError, match=r"vo=deepvo has no weights: give vo.weights=FILE, .* add trainer=cpu"):
-        provide_weights(config, {"vo": "deepvo"}, ["vo"], build(config, "dataset", Dataset), shown=False)
-    config = composed(*SMALL, "trainer.devices=2")
-    with pytest.raises(ConfigError, match="trainer.devices=2: an experiment trains vo=deepvo in one process"):
-        provide_weights(config, CHOICES, ["vo"], build(config, "dataset", Dataset), shown=False)
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        (
+            ["trainer=none", "vo.size_px=[64,32]", "vo.width=0.03"],
+            r"vo=deepvo has no weights: give vo.weights=FILE, .* trainer=cpu",
+        ),
+        ([*SMALL, "trainer.devices=2"], "trainer.devices=2: an experiment trains vo=deepvo in one process"),
+        ([*SMALL, "trainer.resume=x"], "trainer.resume=x: an experiment goes on by itself"),
+        ([*SMALL, "trainer.train=[frontend]"], r"trainer.train=\['frontend'\] leaves vo without weights"),
+        ([*SMALL, "trainer.train=vo"], r"trainer.train must be a list of slots, such as \[vo\]"),
+    ],
+)
+def test_what_cannot_be_trained_is_told(overrides, sentence):
+    config = composed("system=deepvo", *overrides)
+    pipeline = build_pipeline(config, {"vo": "deepvo"})
+    with pytest.raises(ConfigError, match=sentence):
+        provide_weights(config, {"vo": "deepvo"}, pipeline, build(config, "dataset", Dataset), shown=False)
+
+
+def test_weights_to_start_from_count_by_their_content(tmp_path):
+    file = tmp_path / "start.safetensors"
+    keys = []
+    for content in (b"one", b"two", b"one"):
+        file.write_bytes(content)
+        keys.append(_bearing({"weights": None, "backbone": {"weights": str(file)}, "device": "cpu"}))
+    assert keys[0] == keys[2] != keys[1]
+    assert "device" not in keys[0]
 
 
 def test_recordings_that_are_learned_from_and_tested_on_are_told(tmp_path, caplog):

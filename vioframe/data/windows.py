@@ -128,7 +128,7 @@ def cut_window(sequence: StoredSequence, start: int, pairs: int, recording: int 
 
 
 def _between(imu: ImuBlock | None, first_ns: int, last_ns: int) -> tuple[Array, Array]:
-    """Samples (N, 6), times (N,) s, with one exactly at both ends, interpolated; none where some are missing."""
+    """Samples (N, 6), times (N,) s, with one exactly at both ends, interpolated; none beyond the samples there are."""
     if imu is None or len(imu) < 2 or imu.stamps_ns[0] > first_ns or imu.stamps_ns[-1] < last_ns:
         return np.zeros((0, 6)), np.zeros(0)
     inner = slice(
@@ -199,7 +199,7 @@ class WindowIndex:
     def tiled(self, advance: int) -> Self:
         """The windows that cover each unbroken run of images once, when each answers for its last ``advance`` pairs.
 
-        The last window of a run is moved back so that it ends with it; what it answers again is the same.
+        The last window of a run is moved back so that it ends with it, and answers some pairs again.
         """
         kept = [int(number) for run in self._runs() for number in (*run[:-1:advance], run[-1])]
         other = object.__new__(type(self))
@@ -219,3 +219,19 @@ def check_split(training: Sequence[str], validation: Sequence[str]) -> None:
         raise ConfigError(
             f"training_data: {', '.join(both)} is both trained on and validated with: give each recording one purpose"
         )
+
+
+def check_no_shared_images(training: Sequence[StoredSequence], validation: Sequence[StoredSequence]) -> None:
+    """Refuse stretches of one recording that overlap.
+
+    Raises:
+        ConfigError: with their names.
+    """
+    for one, other in itertools.product(training, validation):
+        # A stretch of a recording is called 06.0-90, the whole 06.
+        same = one.name.partition(".")[0] == other.name.partition(".")[0]
+        if same and np.intersect1d(one.stamps_ns, other.stamps_ns).size:
+            raise ConfigError(
+                f"training_data: {one.name}, which is trained on, and {other.name}, which is validated with, share "
+                "images: give stretches that do not overlap"
+            )

@@ -103,6 +103,11 @@ class TrainingModule(lightning.LightningModule):
         _, losses = self.run_parts(batch)
         return {name: value if name == "loss" else value.detach() for name, value in losses.items()}
 
+    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Have validated what a training ends with, whatever ``validate_every`` says."""
+        if self.trainer.should_stop or self.current_epoch + 1 == self.trainer.max_epochs:
+            self.trainer.check_val_every_n_epoch = 1
+
     def on_validation_epoch_start(self) -> None:
         """Forget the predictions of the last validation."""
         self._predicted = [np.tile(np.eye(4), (len(sequence) - 1, 1, 1)) for sequence in self._validation]

@@ -96,6 +96,8 @@ class TrainerOptions:
             value = getattr(self, name)
             if not isinstance(value, int) or value < 1:
                 raise ConfigError(f"trainer.{name} must be a whole number of 1 or more, got {value!r}")
+        if isinstance(self.train, str):
+            raise ConfigError(f"trainer.train must be a list of slots, such as [{self.train}], got {self.train!r}")
         if self.max_minutes is not None:
             check_positive("trainer", max_minutes=self.max_minutes)
         check_positive(

@@ -17,12 +17,13 @@ from typing import Any
 import lightning
 import numpy as np
 import torch
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.accelerators import CUDAAccelerator
 from lightning.pytorch.callbacks import Callback
 
 from vioframe import __version__
 from vioframe.data.windows import StoredSequence, WindowIndex
-from vioframe.errors import DataError
+from vioframe.errors import ConfigError, DataError
 from vioframe.interfaces import Trainable
 from vioframe.learning.callbacks import (
     Bar,
@@ -118,11 +119,13 @@ def train_parts(
         DataError: recordings that are too short, or a resume file that does not fit.
         KeyboardInterrupt: the user stopped it; weights and resume file are those of the last epoch.
     """
-    pairs = options.pairs or max(part.context_pairs for part in parts.values())
     context = max(part.context_pairs for part in parts.values())
+    pairs = options.pairs or context
+    if pairs < context:
+        log.warning("trainer.pairs=%d is less than the %d pairs that one answer takes, which are taken", pairs, context)
     train_index = WindowIndex(training.sequences, max(pairs, context), split="training")
     validation_index = _validation_windows(validation.sequences, max(pairs, context))
-    constant = _constant_score(training, validation, options)
+    constant = _constant_score(training, validation_index, context, options)
     seed_everything(options.seed)
     module = TrainingModule(parts, options, validation.sequences, constant)
     data = WindowData(
@@ -157,12 +160,17 @@ def _validation_windows(sequences: Sequence[StoredSequence], pairs: int) -> Wind
     return index if longer == pairs else WindowIndex(sequences, longer, split="validation")
 
 
-def _constant_score(training: Split, validation: Split, options: TrainerOptions) -> Score:
+def _constant_score(training: Split, windows: WindowIndex, context: int, options: TrainerOptions) -> Score:
+    """Of the pairs that validation answers, and no others."""
     motion = mean_motion(training.sequences)
+    answered = [np.zeros(len(sequence) - 1, dtype=np.bool_) for sequence in windows.sequences]
+    for usable, sequence in zip(answered, windows.sequences, strict=True):
+        for place in range(context - 1, windows.pairs):
+            usable[sequence.starts(windows.pairs) + place] = True
     return score_motions(
-        validation.sequences,
-        [np.tile(motion, (len(sequence) - 1, 1, 1)) for sequence in validation.sequences],
-        [np.ones(len(sequence) - 1, dtype=np.bool_) for sequence in validation.sequences],
+        windows.sequences,
+        [np.tile(motion, (len(sequence) - 1, 1, 1)) for sequence in windows.sequences],
+        answered,
         lengths_m=[float(length) for length in options.segment_lengths_m],
         step=options.segment_step,
     )
@@ -180,7 +188,7 @@ def _trainer(options: TrainerOptions, folder: Path, callbacks: list[Callback]) -
         precision = "bf16-mixed"
     if gpu:
         torch.set_float32_matmul_precision("high")
-    with _quiet():
+    with _quiet(), _told(f"trainer.accelerator={options.accelerator}, trainer.devices={options.devices}"):
         return lightning.Trainer(
             accelerator=options.accelerator,
             devices=options.devices,
@@ -214,12 +222,17 @@ def _fit(trainer: lightning.Trainer, module: TrainingModule, data: WindowData, o
         raise DataError(f"trainer.resume={options.resume}: there is no such file; a run writes resume.ckpt each epoch")
     before = signal.getsignal(signal.SIGINT)
     try:
-        with _quiet():
+        with _quiet(), _told(f"trainer.max_epochs={options.max_epochs}, trainer.resume={options.resume}"):
             # Weights-only: the file is data, and one that holds anything else is refused.
             trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
     except SystemExit as error:
         # Lightning ends the process after Ctrl-C; what it was called from has things to close first.
         raise KeyboardInterrupt from error
+    except torch.cuda.OutOfMemoryError as error:
+        raise ConfigError(
+            f"trainer.batch_size={options.batch_size} at trainer.size_px={list(options.size_px)} does not fit into the "
+            "memory of the GPU: make one of them smaller"
+        ) from error
     except (pickle.UnpicklingError, EOFError) as error:
         raise DataError(
             f"trainer.resume={options.resume} is not a whole resume file of vioframe: begin anew"
@@ -259,7 +272,7 @@ def _card(
         "data": data,
         "split_sha256": hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest(),
         "code": {"vioframe": __version__, "torch": torch.__version__, "lightning": lightning.__version__},
-        "licence": "Apache-2.0",
+        "licence": "Apache-2.0, beside the terms of the data, and of the weights it may have started from",
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "trainer": options.settings(),
         "constant_motion": asdict(constant),
@@ -275,6 +288,15 @@ def _figures(module: TrainingModule, options: TrainerOptions) -> dict[str, objec
     lengths = [float(length) for length in options.segment_lengths_m]
     finite = {name: value if math.isfinite(value) else None for name, value in figures.items()}
     return {"validation": {**finite, "segment_lengths_m": lengths, "protocol": _PROTOCOL}}
+
+
+@contextmanager
+def _told(options: str) -> Iterator[None]:
+    """What lightning finds wrong with the options, as one sentence that names them."""
+    try:
+        yield
+    except MisconfigurationException as error:
+        raise ConfigError(f"{options}: {str(error).strip().splitlines()[0]}") from error
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import signal
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures import wait as wait_for
@@ -18,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from vioframe.build import build
 from vioframe.data.recording import Dataset
 from vioframe.data.sequence_cache import SequenceCache, read_stored
-from vioframe.data.windows import check_split
+from vioframe.data.windows import check_no_shared_images, check_split
 from vioframe.errors import DataError
 from vioframe.tasks.progress import share_progress
 
@@ -80,6 +81,7 @@ def read_splits(
     for split in _SPLITS:
         found = [read_stored(folder) for job, folder in zip(jobs, folders, strict=True) if job.split == split]
         splits.append(Split(sequences=tuple(one for one, _ in found), hashes=tuple(content for _, content in found)))
+    check_no_shared_images(splits[0].sequences, splits[1].sequences)
     return splits[0], splits[1]
 
 
@@ -134,6 +136,8 @@ def _share(done: "Synchronized[float]") -> None:
     import cv2
 
     _done = done
+    # Ended on the way, it takes its unfinished folder with it.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     # Ctrl-C reaches all processes of a terminal; the first one ends the others.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
@@ -152,6 +156,10 @@ def _store(job: _Job) -> Path:
                 _done.value += (frames - told) / total
             told = frames
 
-    folder = job.cache.store(recording, job.source, advance)
+    try:
+        folder = job.cache.store(recording, job.source, advance)
+    except SystemExit:
+        # The pool's own loop would take it for a result.
+        os._exit(1)
     advance(total)
     return folder

@@ -43,12 +43,12 @@ def run(config: DictConfig) -> int:
     in_sweep = hydra_config.mode == RunMode.MULTIRUN
     pipeline = build_pipeline(config, choices)
     dataset = build_dataset(config, choices.get("dataset", ""))
-    if slots := untrained_slots(pipeline):
+    if untrained_slots(pipeline):
         # What the recordings would have refused is refused before the time of a training is spent.
         check_rig(pipeline.parts(), dataset.open(dataset.sequences[0]).rig, choices)
         with terminate_like_interrupt():
             try:
-                provide_weights(config, choices, slots, dataset, shown=bool(config.progress) and not in_sweep)
+                provide_weights(config, choices, pipeline, dataset, shown=bool(config.progress) and not in_sweep)
             except KeyboardInterrupt:
                 return INTERRUPTED
         pipeline = build_pipeline(config, choices)

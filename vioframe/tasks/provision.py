@@ -22,7 +22,7 @@ from vioframe.data.recording import Dataset
 from vioframe.errors import ConfigError, DataError
 from vioframe.interfaces import Trainable
 from vioframe.learning import require_torch
-from vioframe.pipeline import SLOTS, Pipeline
+from vioframe.pipeline import Pipeline
 from vioframe.tasks.decoding import read_splits
 from vioframe.tasks.fitting import fit_parts, trainable_parts, trainer_options
 from vioframe.tracking import Tracker
@@ -38,19 +38,21 @@ _RESULT = "weights.json"
 
 def untrained_slots(pipeline: Pipeline) -> list[str]:
     """Slots of the parts whose answers mean nothing before they are trained."""
-    filled = pipeline.parts()
-    return [slot for slot, part in filled.items() if isinstance(part, Trainable) and part.needs_training]
+    return [slot for slot, part in _with_nets(pipeline).items() if part.needs_training]
 
 
 def provide_weights(
-    config: DictConfig, choices: Mapping[str, str], slots: list[str], tested: Dataset, *, shown: bool
+    config: DictConfig, choices: Mapping[str, str], pipeline: Pipeline, tested: Dataset, *, shown: bool
 ) -> None:
-    """Fill in ``<slot>.weights`` of the parts that have none, by training them or finding what was trained before.
+    """Fill in ``<slot>.weights`` of the parts that need training, by training them or finding what was trained before.
+
+    Parts that work without weights, such as TVNet, are trained along only where ``trainer.train`` names them: their
+    steps may cost far more than the net's.
 
     Args:
         config: the whole; changed in place.
         choices: by group.
-        slots: of the parts that need training, as :func:`untrained_slots` returns them.
+        pipeline: as ``config`` describes it.
         tested: what the experiment will run on.
         shown: whether to show progress bars.
 
@@ -59,25 +61,15 @@ def provide_weights(
         DataError: recordings that cannot be learned from.
         KeyboardInterrupt: the user stopped the training; it can go on.
     """
+    slots = untrained_slots(pipeline)
     told = " and ".join(f"{slot}={choices.get(slot, '')}" for slot in slots)
     require_torch(f"training {told}", training=True)
-    try:
-        options = trainer_options(config, choices)
-    except ConfigError as error:
-        given = " ".join(f"{slot}.weights=FILE" for slot in slots)
-        raise ConfigError(f"{told} has no weights: give {given}, or have it trained first ({error})") from error
-    if options.devices > 1:
-        raise ConfigError(
-            f"trainer.devices={options.devices}: an experiment trains {told} in one process; train it with task=train "
-            "first, and give its weights"
-        )
+    options = _options(config, choices, slots, told)
     splits = read_splits(config, options, choices, shown=shown)
     _warn_of_leak(splits, tested)
-    # A part that was given its weights keeps them; one that works without, such as TVNet, is trained along.
-    chosen = options.train or [slot for slot in _slots_with_weights(config) if config[slot].weights is None]
-    options = replace(options, train=list(chosen))
-    key = _key(config, options, splits)
-    place = Path(options.cache).expanduser() / "trained" / f"{'-'.join(choices.get(s, s) for s in chosen)}-{key[:16]}"
+    key = _key(config, options, _with_nets(pipeline), splits)
+    name = "-".join(choices.get(slot, slot) for slot in options.train or ())
+    place = Path(options.cache).expanduser() / "trained" / f"{name}-{key[:16]}"
     found = _trained(place)
     if not found:
         from filelock import FileLock
@@ -88,8 +80,38 @@ def provide_weights(
             found = _trained(place) or _train(config, choices, options, splits, place, shown=shown)
     else:
         log.info("%s was trained before: %s", told, place)
-    for slot, name in found.items():
-        OmegaConf.update(config, f"{slot}.weights", str(place / name))
+    for slot, file in found.items():
+        OmegaConf.update(config, f"{slot}.weights", str(place / file))
+
+
+def _with_nets(pipeline: Pipeline) -> dict[str, Trainable]:
+    return {slot: part for slot, part in pipeline.parts().items() if isinstance(part, Trainable)}
+
+
+def _options(config: DictConfig, choices: Mapping[str, str], slots: list[str], told: str) -> "TrainerOptions":
+    """The trainer's options, for ``slots``."""
+    try:
+        options = trainer_options(config, choices)
+    except ConfigError as error:
+        given = " ".join(f"{slot}.weights=FILE" for slot in slots)
+        raise ConfigError(f"{told} has no weights: give {given}, or have it trained first ({error})") from error
+    if options.devices > 1:
+        raise ConfigError(
+            f"trainer.devices={options.devices}: an experiment trains {told} in one process; train it with task=train "
+            "first, and give its weights"
+        )
+    if options.resume is not None:
+        raise ConfigError(
+            f"trainer.resume={options.resume}: an experiment goes on by itself with what it was training; use it with "
+            "task=train"
+        )
+    left = [slot for slot in slots if options.train is not None and slot not in options.train]
+    if left:
+        raise ConfigError(
+            f"trainer.train={list(options.train or ())} leaves {', '.join(left)} without weights: add it, or give its "
+            "weights"
+        )
+    return options if options.train is not None else replace(options, train=slots)
 
 
 def _warn_of_leak(splits: "tuple[Split, Split]", tested: Dataset) -> None:
@@ -101,19 +123,25 @@ def _warn_of_leak(splits: "tuple[Split, Split]", tested: Dataset) -> None:
         log.warning("%s is learned from and tested on: these figures are not those of unseen data", ", ".join(both))
 
 
-def _slots_with_weights(config: DictConfig) -> list[str]:
-    return [slot for slot in SLOTS if isinstance(config.get(slot), DictConfig) and "weights" in config[slot]]
-
-
-def _key(config: DictConfig, options: "TrainerOptions", splits: "tuple[Split, Split]") -> str:
-    # All parts: those without a net may feed those with one. Where they compute and keep files changes nothing.
-    parts = {
-        slot: {name: value for name, value in config[slot].items() if name not in ("device", "cache")}
-        for slot in SLOTS
-        if isinstance(config.get(slot), DictConfig)
-    }
-    words = [__version__, options.settings(), parts, [split.hashes for split in splits]]
+def _key(
+    config: DictConfig, options: "TrainerOptions", parts: Mapping[str, Trainable], splits: "tuple[Split, Split]"
+) -> str:
+    # Parts without a net take no part in a training.
+    used = {slot: _bearing(OmegaConf.to_container(config[slot], resolve=True)) for slot in parts}
+    words = [__version__, options.settings(), used, [split.hashes for split in splits]]
     return hashlib.sha256(json.dumps(words, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _bearing(node: object) -> object:
+    """What of a part's options has a bearing on what it learns: of files it starts from the content, not the name."""
+    if not isinstance(node, dict):
+        return node
+    kept = {name: _bearing(value) for name, value in node.items() if name not in ("device", "cache")}
+    source = kept.get("weights")
+    if isinstance(source, str) and Path(source).expanduser().is_file():
+        with Path(source).expanduser().open("rb") as file:
+            kept["weights"] = hashlib.file_digest(file, "sha256").hexdigest()
+    return kept
 
 
 def _trained(place: Path) -> dict[str, str]:

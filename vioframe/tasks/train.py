@@ -9,6 +9,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from vioframe.build import build
+from vioframe.errors import DataError
 from vioframe.learning import require_torch
 from vioframe.tasks.decoding import read_splits
 from vioframe.tasks.fitting import fit_parts, trainable_parts, trainer_options
@@ -27,6 +28,8 @@ def run(config: DictConfig) -> int:
     follows = int(os.environ.get("LOCAL_RANK", "0")) > 0
     shown = bool(config.progress) and hydra_config.mode != RunMode.MULTIRUN and not follows
     options = trainer_options(config, choices)
+    if options.resume is not None and not Path(options.resume).expanduser().is_file():
+        raise DataError(f"trainer.resume={options.resume}: there is no such file; a run writes resume.ckpt each epoch")
     parts = trainable_parts(config, choices, options.seed)
     # A run that goes on goes on where it was: its weights and its curve are there.
     output = Path(hydra_config.runtime.output_dir)
@@ -41,7 +44,10 @@ def run(config: DictConfig) -> int:
                 parts, splits, options, config=config, choices=choices, folder=folder, tracker=tracker, shown=shown
             )
         except KeyboardInterrupt:
-            log.warning("interrupted; go on with trainer.resume=%s", folder / "resume.ckpt")
+            resume = folder / "resume.ckpt"
+            log.warning(
+                "interrupted; %s", f"go on with trainer.resume={resume}" if resume.exists() else "no epoch was complete"
+            )
             tracker.finish("killed", "interrupted by the user")
             return INTERRUPTED
         if follows:
@@ -49,7 +55,10 @@ def run(config: DictConfig) -> int:
         if (output / "config.yaml").exists():
             tracker.log_file(output / "config.yaml")
         if not trained.weights:
-            log.warning("no validation was reached in %d epochs, so no weights were kept; %s", trained.epochs, folder)
+            sentence = f"no validation was reached in {trained.epochs} epochs, so no weights were kept"
+            log.error("%s; %s", sentence, folder)
+            tracker.finish("failed", sentence)
+            return 1
         for slot, path in trained.weights.items():
             log.info("weights of %s: %s (use them with %s.weights=...)", slot, path, slot)
     return 0

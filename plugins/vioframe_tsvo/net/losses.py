@@ -54,7 +54,7 @@ class FixedWeights(nn.Module):
         """
         super().__init__()
         if not rotation_weight > 0.0:
-            raise ConfigError(f"vo.loss.rotation_weight must be positive, got {rotation_weight}")
+            raise ConfigError(f"vo.rotation_weight must be positive, got {rotation_weight}")
         self.rotation_weight = rotation_weight
 
     def forward(self, predicted: Tensor, target: Tensor) -> dict[str, Tensor]:
@@ -70,16 +70,12 @@ class FixedWeights(nn.Module):
 class GaussianLikelihood(nn.Module):
     """For a net that states variances: ``½ Σ (e² exp(−s) + s)`` over the six numbers, so that errors set each s."""
 
-    LARGEST = 12.0
-    """Beyond exp(±12) a variance is clipped: one sample known to 1e-3 units must not outweigh all others."""
-
     def forward(self, predicted: Tensor, target: Tensor, log_variances: Tensor) -> dict[str, Tensor]:
         """``loss``, which is minimised, and the plain errors, for the record."""
-        s = log_variances.clamp(-self.LARGEST, self.LARGEST)
         rotation, translation = squared_errors(predicted, target)
         squared = (predicted - target).square()
         return {
-            "loss": 0.5 * (squared * torch.exp(-s) + s).sum(-1).mean(),
+            "loss": 0.5 * (squared * torch.exp(-log_variances) + log_variances).sum(-1).mean(),
             "rotation": rotation.detach(),
             "translation": translation.detach(),
         }

@@ -65,7 +65,14 @@ def test_not_worse_than_scikit_image_with_equal_settings(scenes) -> None:
     ours, theirs = [], []
     for rig, frames, truth, seen in scenes:
         frontend = TvnetFrontend(
-            size_px=None, device="cpu", quantise=False, warps=5, iterations=5, coupling=0.3, smoothing_px=0.0
+            size_px=None,
+            device="cpu",
+            quantise=False,
+            warps=5,
+            iterations=5,
+            coupling=0.3,
+            smoothing_px=0.0,
+            trust_outside=True,
         )
         ours.append(errors_of(run(frontend, rig, frames), truth, seen).mean())
         theirs.append(errors_of(scikit_flow(registration, frames, 0.3, 5, 5), truth, seen).mean())

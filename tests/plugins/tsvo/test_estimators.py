@@ -236,7 +236,7 @@ def test_weights_of_another_net_are_refused(scene, tmp_path):
         tsvo(stack=4, weights=str(path)).setup(scene.rig)
     with pytest.raises(DataError, match="backbone='googlenet' where 'resnet50' is needed"):
         tsvo(backbone=Backbone(name="resnet50"), weights=str(path)).setup(scene.rig)
-    with pytest.raises(DataError, match="part='tsvo' where 'deepvo' is needed"):
+    with pytest.raises(DataError, match="holds weights of 'tsvo', not of 'deepvo'"):
         deepvo(weights=str(path)).setup(scene.rig)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(DataError, match="not a whole safetensors file"):
@@ -302,7 +302,7 @@ def test_calls_and_data_that_cannot_work_are_refused(scene, batch):
     with pytest.raises(DataError, match="has no image"):
         part.estimate(scene.features[0], VisualFeatures(frame=Frame(stamp_ns=1), flow=scene.features[1].flow))
     windows, upstream = batch
-    with pytest.raises(ConfigError, match="use frontend=tvnet"):
+    with pytest.raises(ConfigError, match="use frontend=dis or frontend=tvnet"):
         part.forward_batch(windows, {})
     with pytest.raises(ConfigError, match="trainer.size_px makes training see 320×240 px, but vo.size_px is 96×64"):
         deepvo(size_px=(96, 64)).forward_batch(windows, {})
@@ -318,7 +318,7 @@ def test_calls_and_data_that_cannot_work_are_refused(scene, batch):
 def test_one_word_chooses_the_backbone(backbone):
     config = composed("vo=tsvo", f"backbone={backbone}", "vo.stack=5")
     assert (config.vo.backbone.name, config.vo.stack) == (backbone, 5)
-    assert "tvnet" in str(config.frontend._target_).lower()
+    assert "dis" in str(config.frontend._target_).lower()
     part = build(config, "vo", VOEstimator, "tsvo")
     assert (part.architecture["backbone"], part.architecture["stack"]) == (backbone, 5)
 

@@ -51,21 +51,23 @@ class StopDivergence(Callback):
         if len(self._block) < _BLOCK and not trainer.is_last_batch:
             return
         block = torch.stack(self._block)
-        mean = float(block.mean())
+        # All processes judge by the same number, so that all stop or none.
+        mean = float(trainer.strategy.reduce(block.mean(), reduce_op="mean"))
         self._block = []
         if self._first is None:
             # Before any step was taken: a wild learning rate shows within the first block.
-            self._first = float(block[0])
+            self._first = float(trainer.strategy.reduce(block[0], reduce_op="mean"))
         limit = min(self._least, self._first) + self._factor * max(abs(self._first), abs(min(self._least, self._first)))
         if not math.isfinite(mean) or mean > limit:
             was = "" if math.isinf(self._least) else f", after {self._least:.3g} at best"
             kept = (
-                "The best weights from before are kept"
+                "The best weights from before, where a validation was reached, are kept"
                 if trainer.current_epoch
                 else "No epoch was complete, so there are no weights to keep"
             )
             raise ConfigError(
                 f"trainer.learning_rate={self._learning_rate:g} makes the training diverge: the loss is {mean:.3g} at "
-                f"step {trainer.global_step}{was}; choose a smaller one, or a smaller trainer.gradient_clip. {kept}"
+                f"step {trainer.global_step}{was}; choose a smaller one, or clip gradients "
+                f"(trainer.gradient_clip). {kept}"
             )
         self._least = min(self._least, mean)
