@@ -150,24 +150,23 @@ class WindowIndex:
     Args:
         sequences: of one split.
         pairs: pairs of images in each window.
-        stride: images from the start of one window to that of the next.
         split: what the recordings are for, for messages.
 
     Raises:
-        ConfigError: ``pairs`` or ``stride`` below 1.
+        ConfigError: ``pairs`` below 1.
         DataError: recordings whose images differ in size or colour; no window at all.
     """
 
-    def __init__(self, sequences: Sequence[StoredSequence], pairs: int, *, stride: int = 1, split: str) -> None:
-        if pairs < 1 or stride < 1:
-            raise ConfigError(f"trainer.pairs and the stride must be 1 or more, got {pairs} and {stride}")
+    def __init__(self, sequences: Sequence[StoredSequence], pairs: int, *, split: str) -> None:
+        if pairs < 1:
+            raise ConfigError(f"trainer.pairs must be 1 or more, got {pairs}")
         shapes = {sequence.images.shape[1:]: sequence.name for sequence in sequences}
         if len(shapes) > 1:
             told = ", ".join(f"{name} has {shape[1]}×{shape[0]}×{shape[2]}" for shape, name in shapes.items())
             raise DataError(f"the recordings for {split} must all give images of one size, but {told}")
         self.sequences = tuple(sequences)
         self.pairs = pairs
-        found = [sequence.starts(pairs)[::stride] for sequence in sequences]
+        found = [sequence.starts(pairs) for sequence in sequences]
         self._recording = np.repeat(np.arange(len(found)), [len(starts) for starts in found])
         self._start = np.concatenate([*found, np.zeros(0, dtype=np.int64)])
         if len(self._start) == 0:

@@ -56,8 +56,10 @@ def _error_panel(
         # Bounds that dwarf the error would hide it.
         limit = max(limit, min(1.1 * float(bound[known].max()), 5.0 * largest))
         inside = float((np.abs(values[known]) <= bound[known]).mean())
+        # A fuser that knows its start only would else look as if it knew the rest.
+        few = "" if known.all() else f" where there are bounds: {known.sum()} of {len(known)} states"
         axes.text(
-            0.01, 0.95, f"{100 * inside:.1f} % inside", transform=axes.transAxes, ha="left", va="top",
+            0.01, 0.95, f"{100 * inside:.1f} % inside{few}", transform=axes.transAxes, ha="left", va="top",
             fontsize=8, color="#5a5a5a",
         )  # fmt: skip
     axes.plot(time_s, broken[:, 0], color=ESTIMATE, linewidth=1.1, label="truth − estimate")
