@@ -2,27 +2,22 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property
 from hashlib import blake2b
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vioframe.errors import ConfigError
 from vioframe.interfaces import FLOW
-from vioframe.learning import require_torch
+from vioframe.learning.holder import NetHolder
 from vioframe.types import SensorRig
 from vioframe.vision.flow_levels import LEVELS_A_SIDE, ZERO_LEVEL
 from vioframe_flow.frontend import FlowFrontend, require
 
 if TYPE_CHECKING:
-    import torch
     from torch import Tensor
 
     from vioframe.learning.batch import WindowBatch
     from vioframe_flow.net import TvNet
-
-_DEVICES = ("auto", "cpu", "cuda")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,13 +117,16 @@ class TvnetFrontend(FlowFrontend):
             learn_constants=learn_constants,
             start_grid=None if start_grid is None else tuple(start_grid),  # type: ignore[arg-type]  # checked there
         )
-        require("device", device, device in _DEVICES, f"one of {', '.join(_DEVICES)}")
-        require_torch("frontend=tvnet")
+        # Its first weights make it classical TV-L1.
+        self._holder = NetHolder(self, "frontend", "tvnet", self._make_net, weights, device, works_untrained=True)
         self._own_loss = own_loss
-        self._weights = weights
-        self._device_option = device
 
-    @cached_property
+    def _make_net(self) -> "TvNet":
+        from vioframe_flow.net import TvNet
+
+        return TvNet(**asdict(self._options))
+
+    @property
     def net(self) -> "TvNet":
         """The network; made when first asked for, since torch takes seconds to import.
 
@@ -136,19 +134,7 @@ class TvnetFrontend(FlowFrontend):
             ConfigError: there is no such file of weights.
             DataError: the file is of another architecture, or damaged.
         """
-        from vioframe_flow.net import TvNet
-
-        net = TvNet(**asdict(self._options)).eval()
-        if self._weights is not None:
-            from vioframe.learning.weights import load_weights, locate_weights
-
-            # The file is held against a part, which this one is as soon as it has its net.
-            self.__dict__["net"] = net
-            try:
-                load_weights(locate_weights(self._weights, "frontend.weights"), self, "frontend.weights")
-            except BaseException:
-                del self.__dict__["net"]
-                raise
+        net: TvNet = self._holder.net  # type: ignore[assignment]  # it made it
         return net
 
     @property
@@ -165,16 +151,8 @@ class TvnetFrontend(FlowFrontend):
 
     def setup(self, rig: SensorRig) -> None:
         """Forget the last image and bring the net to its device; errors as of the interface."""
-        self.net.to(self._device()).eval()
+        self._holder.prepare()
         super().setup(rig)
-
-    def _device(self) -> "torch.device":
-        import torch
-
-        there = torch.cuda.is_available()
-        if self._device_option == "cuda" and not there:
-            raise ConfigError("frontend.device=cuda, but torch finds no such GPU here: use frontend.device=auto or cpu")
-        return torch.device("cuda" if there and self._device_option != "cpu" else "cpu")
 
     def solve(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """Flow (B, H, W, 2) float32 px of pairs of grey images (B, H, W) uint8, all at once."""

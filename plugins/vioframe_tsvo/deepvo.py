@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from vioframe.learning.batch import WindowBatch
+    from vioframe.learning.motion import Rotation
     from vioframe_tsvo.net.deepvo import LstmState
-    from vioframe_tsvo.net.motion import Rotation
 
 
 class DeepVo(LearnedVO):

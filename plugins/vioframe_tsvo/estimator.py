@@ -1,10 +1,8 @@
 """What learned estimators have in common: weights, device, images, losses, and numbers into motions."""
 
-import logging
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
 
 import cv2
@@ -13,23 +11,19 @@ import numpy as np
 from vioframe.checks import check_positive
 from vioframe.errors import ConfigError, DataError, StateError
 from vioframe.interfaces import CONSISTENT_SCALE, IMAGES, METRIC_SCALE, RELATIVE_POSE, VOEstimator
-from vioframe.learning import require_torch
+from vioframe.learning.holder import NetHolder
 from vioframe.types import Frame, Image, RelativePose, SensorRig
 
 if TYPE_CHECKING:
-    import torch
     from torch import Tensor, nn
 
     from vioframe.learning.batch import WindowBatch
-    from vioframe_tsvo.net.motion import Rotation
+    from vioframe.learning.motion import Rotation
     from vioframe_tsvo.net.two_stream import MotionEstimate
-
-log = logging.getLogger(__name__)
 
 _CHOICES = {
     "rotation": ("log", "euler"),
     "loss": ("learned", "fixed", "likelihood"),
-    "device": ("auto", "cpu", "cuda"),
 }
 # In units of the output.
 _LARGEST_LOG_VARIANCE = 12.0
@@ -118,15 +112,13 @@ class LearnedVO(VOEstimator):
     provides: ClassVar[frozenset[str]] = frozenset({RELATIVE_POSE, CONSISTENT_SCALE, METRIC_SCALE})
 
     def __init__(self, name: str, options: MotionOptions) -> None:
-        require_torch(f"vo={name}")
+        self._holder = NetHolder(self, "vo", name, self._make_net, options.weights, options.device)
         self._name = name
         self._options = options
         self._seen: tuple[Frame, Tensor] | None = None
         self._ready = False
-        # Whether there is a reason to believe its answers: weights, or a training in this process.
-        self._taught = options.weights is not None
 
-    @cached_property
+    @property
     def net(self) -> "nn.Module":
         """``motion``, the network, and ``weighing``, its loss; made when first asked for: torch is slow to import.
 
@@ -134,32 +126,7 @@ class LearnedVO(VOEstimator):
             ConfigError: there is no such file of weights.
             DataError: the file is of another architecture, or damaged.
         """
-        from torch import nn
-
-        from vioframe_tsvo.net.losses import FixedWeights, GaussianLikelihood, LearnedWeights
-
-        weighing: nn.Module
-        if self._options.loss == "learned":
-            weighing = LearnedWeights(
-                log_variance_rotation=self._options.log_variance_rotation,
-                log_variance_translation=self._options.log_variance_translation,
-            )
-        elif self._options.loss == "fixed":
-            weighing = FixedWeights(rotation_weight=self._options.rotation_weight)
-        else:
-            weighing = GaussianLikelihood()
-        net = nn.ModuleDict({"motion": self.make_motion_net(), "weighing": weighing}).eval()
-        if self._options.weights is not None:
-            from vioframe.learning.weights import load_weights, locate_weights
-
-            # The file is held against a part, which this one is as soon as it has its net.
-            self.__dict__["net"] = net
-            try:
-                load_weights(locate_weights(self._options.weights, "vo.weights"), self, "vo.weights")
-            except BaseException:
-                del self.__dict__["net"]
-                raise
-        return net
+        return self._holder.net
 
     @property
     @abstractmethod
@@ -169,7 +136,7 @@ class LearnedVO(VOEstimator):
     @property
     def needs_training(self) -> bool:
         """Without weights its motions are those of a random net."""
-        return self._options.weights is None
+        return self._holder.needs_training
 
     @property
     @abstractmethod
@@ -193,20 +160,13 @@ class LearnedVO(VOEstimator):
         """
         if not rig.cameras:
             raise DataError(f"vo={self._name} needs a camera, but the recording's calibration has none")
-        self.net.to(self._device()).eval()
-        if not self._taught:
-            log.warning(
-                "vo=%s has no weights, so its motions are those of a random net: give vo.weights=FILE (task=train "
-                "makes one)",
-                self._name,
-            )
-            self._taught = True  # once is enough
+        self._holder.prepare()
         self._seen = None
         self._ready = True
 
     def loss(self, outputs: "Mapping[str, Tensor]", batch: "WindowBatch") -> "dict[str, Tensor]":
         """``loss``, and mean squared errors in units of the output, against the last motions of each window."""
-        from vioframe_tsvo.net.motion import vector_from_motion
+        from vioframe.learning.motion import vector_from_motion
 
         vector = outputs["motion"]
         target = vector_from_motion(batch.T_prev_cur[:, -vector.shape[1] :], self._options.rotation)
@@ -216,16 +176,16 @@ class LearnedVO(VOEstimator):
 
     def outputs(self, estimate: "MotionEstimate", answered: int) -> "dict[str, Tensor]":
         """What :meth:`forward_batch` returns: vectors in rad and metres, and the last ``answered`` as motions."""
-        from vioframe_tsvo.net.motion import motion_from_vector
+        from vioframe.learning.motion import motion_from_vector
 
-        self._taught = True
+        self._holder.taught()
         vector, log_variances = self._scaled(estimate)
         named = {"motion": vector, "T_prev_cur": motion_from_vector(vector[:, -answered:], self._options.rotation)}
         return named if log_variances is None else {**named, "log_variances": log_variances}
 
     def relative_pose(self, estimate: "MotionEstimate") -> RelativePose:
         """The motion of one pair, from estimates of any leading axes of length one."""
-        from vioframe_tsvo.net.motion import covariance_from_log_variances, motion_from_vector, vector_from_motion
+        from vioframe.learning.motion import covariance_from_log_variances, motion_from_vector, vector_from_motion
 
         vector, log_variances = (None if each is None else each.reshape(6).double() for each in self._scaled(estimate))
         if vector is None or not bool(vector.isfinite().all()):
@@ -294,7 +254,7 @@ class LearnedVO(VOEstimator):
             # As training images are resized: averages over areas, which leaves nothing to alias.
             image = cv2.resize(image, self._options.size, interpolation=cv2.INTER_AREA)
         channels = image[None].repeat(3, axis=0) if image.ndim == 2 else image.transpose(2, 0, 1)
-        return torch.from_numpy(np.ascontiguousarray(channels)).to(self._device()).float() / 255.0
+        return torch.from_numpy(np.ascontiguousarray(channels)).to(self._holder.device()).float() / 255.0
 
     def _scaled(self, estimate: "MotionEstimate") -> "tuple[Tensor, Tensor | None]":
         """Vectors in rad and metres, and logarithms of rad² and m²."""
@@ -306,13 +266,22 @@ class LearnedVO(VOEstimator):
         limited = estimate.log_variances.clamp(-_LARGEST_LOG_VARIANCE, _LARGEST_LOG_VARIANCE)
         return estimate.vector * units, limited + 2.0 * units.log()
 
-    def _device(self) -> "torch.device":
-        import torch
+    def _make_net(self) -> "nn.Module":
+        from torch import nn
 
-        there = torch.cuda.is_available()
-        if self._options.device == "cuda" and not there:
-            raise ConfigError("vo.device=cuda, but torch finds no such GPU here: use vo.device=auto or cpu")
-        return torch.device("cuda" if there and self._options.device != "cpu" else "cpu")
+        from vioframe.learning.losses import FixedWeights, GaussianLikelihood, LearnedWeights
+
+        weighing: nn.Module
+        if self._options.loss == "learned":
+            weighing = LearnedWeights(
+                log_variance_rotation=self._options.log_variance_rotation,
+                log_variance_translation=self._options.log_variance_translation,
+            )
+        elif self._options.loss == "fixed":
+            weighing = FixedWeights(rotation_weight=self._options.rotation_weight)
+        else:
+            weighing = GaussianLikelihood()
+        return nn.ModuleDict({"motion": self.make_motion_net(), "weighing": weighing})
 
 
 def check_size(key: str, size_px: Sequence[int]) -> None:

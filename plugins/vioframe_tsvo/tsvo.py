@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from vioframe.learning.batch import WindowBatch
-    from vioframe_tsvo.net.motion import Rotation
+    from vioframe.learning.motion import Rotation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

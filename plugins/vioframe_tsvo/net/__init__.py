@@ -1,12 +1,9 @@
 """The networks, as tensors only; importing a module of this folder imports torch.
 
 =================  ====================================================================
-``spatial``        FlowNetS convolutions on an image pair
 ``googlenet``, ``resnet``, ``inception``  the temporal stream, with torchvision's parameter names
 ``backbones``      chooses one of them, widens its first convolution, loads ImageNet files
 ``two_stream``     TSVO: spatial and temporal stream, head
 ``deepvo``         FlowNetS features and two LSTM layers
-``motion``         vectors of six to rigid motions and back, composition
-``losses``         squared errors and how rotation and translation are weighed
 =================  ====================================================================
 """

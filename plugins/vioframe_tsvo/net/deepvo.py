@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from vioframe.errors import ConfigError, ShapeError
-from vioframe_tsvo.net.spatial import LAYERS, PAIR_CHANNELS, FlowNetConvolutions
+from vioframe.learning.flownet import LAYERS, PAIR_CHANNELS, FlowNetConvolutions
 from vioframe_tsvo.net.two_stream import MotionEstimate, MotionHead, centred, check_maps
 
 DEEPVO_LAYERS = LAYERS[:9]

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from vioframe.errors import ConfigError, ShapeError
+from vioframe.learning.flownet import PAIR_CHANNELS, SpatialStream
 from vioframe_tsvo.net.backbones import make_backbone
-from vioframe_tsvo.net.spatial import PAIR_CHANNELS, SpatialStream
 
 MOTION = 6
 """Numbers of a motion vector: rotation, translation."""
@@ -21,7 +21,7 @@ class MotionEstimate(NamedTuple):
     """What the networks answer.
 
     Attributes:
-        vector: (..., 6) motion vectors, see :mod:`vioframe_tsvo.net.motion`.
+        vector: (..., 6) motion vectors, see :mod:`vioframe.learning.motion`.
         log_variances: (..., 6) natural logarithms of their variances, or None where the net has no such outputs.
     """
 

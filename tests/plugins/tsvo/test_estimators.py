@@ -132,7 +132,7 @@ def test_training_reaches_every_parameter(make, batch):
 @pytest.mark.parametrize("rotation", ["log", "euler"])
 def test_the_loss_of_the_truth_is_nothing(make, rotation, batch):
     """With the true motions as vectors, in rad and metres, nothing is left to pay for."""
-    from vioframe_tsvo.net.motion import vector_from_motion
+    from vioframe.learning.motion import vector_from_motion
 
     part = make(loss="fixed", rotation=rotation)
     windows, _ = batch

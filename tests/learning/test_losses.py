@@ -9,7 +9,7 @@ pytest.importorskip("torch", reason="needs torch: pip install 'vioframe[learn]'"
 import torch
 
 from vioframe.errors import ConfigError
-from vioframe_tsvo.net.losses import FixedWeights, GaussianLikelihood, LearnedWeights, squared_errors
+from vioframe.learning.losses import FixedWeights, GaussianLikelihood, LearnedWeights, squared_errors
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def test_learned_weights_settle_at_the_logarithm_of_the_errors(vectors):
 def test_fixed_weights_are_one_to_a_hundred(vectors):
     rotation, translation = squared_errors(*vectors)
     assert FixedWeights()(*vectors)["loss"].item() == pytest.approx((translation + 100 * rotation).item())
-    with pytest.raises(ConfigError, match="rotation_weight must be positive, got 0"):
+    with pytest.raises(ConfigError, match="weight of rotation must be positive, got 0"):
         FixedWeights(rotation_weight=0)
 
 

@@ -54,7 +54,7 @@ class FixedWeights(nn.Module):
         """
         super().__init__()
         if not rotation_weight > 0.0:
-            raise ConfigError(f"vo.rotation_weight must be positive, got {rotation_weight}")
+            raise ConfigError(f"the weight of rotation must be positive, got {rotation_weight}")
         self.rotation_weight = rotation_weight
 
     def forward(self, predicted: Tensor, target: Tensor) -> dict[str, Tensor]:

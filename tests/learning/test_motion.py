@@ -9,7 +9,7 @@ import torch
 from torch.autograd import gradcheck
 
 from vioframe.geometry import se3, so3
-from vioframe_tsvo.net import motion
+from vioframe.learning import motion
 
 # From where the series are used to beyond where they are not, and to nearly half a turn.
 ANGLES = (0.0, 1e-9, 1e-5, 1e-3, 0.03, 0.4999, 0.5001, 1.5, 3.0, 3.1415)
