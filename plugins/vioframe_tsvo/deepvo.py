@@ -138,7 +138,7 @@ class DeepVo(LearnedVO):
         """
         if batch.pairs < self._window:
             raise DataError(f"windows have {batch.pairs} pairs of images, but vo.window={self._window} needs as many")
-        estimate, _ = self.net.get_submodule("motion")(self.pairs_of_batch(batch))
+        estimate, _ = self.net.get_submodule("motion")(self.images.pairs_of_batch(batch.images))
         return self.outputs(estimate, batch.pairs - self._window + 1)
 
     def setup(self, rig: SensorRig) -> None:

@@ -5,14 +5,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-import cv2
-import numpy as np
-
 from vioframe.checks import check_positive
 from vioframe.errors import ConfigError, DataError, StateError
 from vioframe.interfaces import CONSISTENT_SCALE, IMAGES, METRIC_SCALE, RELATIVE_POSE, VOEstimator
 from vioframe.learning.holder import NetHolder
-from vioframe.types import Frame, Image, RelativePose, SensorRig
+from vioframe.learning.images import NetImages, check_size
+from vioframe.types import Frame, RelativePose, SensorRig
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -27,8 +25,6 @@ _CHOICES = {
 }
 # In units of the output.
 _LARGEST_LOG_VARIANCE = 12.0
-# What OpenCV weighs red, green and blue with (ITU-R BT.601).
-_GRAY = (0.299, 0.587, 0.114)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,6 +111,7 @@ class LearnedVO(VOEstimator):
         self._holder = NetHolder(self, "vo", name, self._make_net, options.weights, options.device)
         self._name = name
         self._options = options
+        self.images = NetImages(slot="vo", name=name, size_px=options.size_px, gray=options.gray)
         self._seen: tuple[Frame, Tensor] | None = None
         self._ready = False
 
@@ -209,52 +206,12 @@ class LearnedVO(VOEstimator):
 
         if not self._ready:
             raise StateError(f"{type(self).__name__}.estimate was called before setup(rig): set it up first")
-        before = self._seen[1] if self._seen is not None and self._seen[0] is previous else self._prepare(previous)
-        after = self._prepare(current)
+        device = self._holder.device()
+        before = self._seen[1] if self._seen is not None and self._seen[0] is previous else None
+        before = self.images.of_frame(previous, device) if before is None else before
+        after = self.images.of_frame(current, device)
         self._seen = (current, after)
         return torch.cat([before, after])[None]
-
-    def pairs_of_batch(self, batch: "WindowBatch") -> "Tensor":
-        """The same for a batch: (B, S, 6, H, W).
-
-        Raises:
-            ConfigError: its images have another size than the net's.
-        """
-        from vioframe_tsvo.net.two_stream import pairs_of
-
-        images = batch.images
-        self.check_training_size("trainer.size_px", images)
-        if self._options.gray and images.shape[2] == 3:
-            images = (images * images.new_tensor(_GRAY)[:, None, None]).sum(2, keepdim=True)
-        return pairs_of(images)
-
-    def check_training_size(self, key: str, maps: "Tensor") -> None:
-        """Refuse maps (..., H, W) of another size than the net's, which streaming would have resized.
-
-        Raises:
-            ConfigError: with the option ``key`` that made them so.
-        """
-        if tuple(maps.shape[:-3:-1]) != self._options.size:
-            (width, height), (made_width, made_height) = self._options.size, maps.shape[:-3:-1]
-            raise ConfigError(
-                f"{key} makes training see {made_width}×{made_height} px, but vo.size_px is {width}×{height}: "
-                "set them alike"
-            )
-
-    def _prepare(self, frame: Frame) -> "Tensor":
-        """(3, H, W) in [0, 1]."""
-        import torch
-
-        if not frame.images:
-            raise DataError(f"frame at {frame.stamp_ns} ns has no image, and vo={self._name} needs one")
-        image: Image = frame.images[0]
-        if self._options.gray and image.ndim == 3:
-            image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        if image.shape[1::-1] != self._options.size:
-            # As training images are resized: averages over areas, which leaves nothing to alias.
-            image = cv2.resize(image, self._options.size, interpolation=cv2.INTER_AREA)
-        channels = image[None].repeat(3, axis=0) if image.ndim == 2 else image.transpose(2, 0, 1)
-        return torch.from_numpy(np.ascontiguousarray(channels)).to(self._holder.device()).float() / 255.0
 
     def _scaled(self, estimate: "MotionEstimate") -> "tuple[Tensor, Tensor | None]":
         """Vectors in rad and metres, and logarithms of rad² and m²."""
@@ -282,13 +239,3 @@ class LearnedVO(VOEstimator):
         else:
             weighing = GaussianLikelihood()
         return nn.ModuleDict({"motion": self.make_motion_net(), "weighing": weighing})
-
-
-def check_size(key: str, size_px: Sequence[int]) -> None:
-    """Refuse what is no (width, height).
-
-    Raises:
-        ConfigError: with the key and its value.
-    """
-    if len(size_px) != 2 or not all(isinstance(side, int) and side >= 16 for side in size_px):
-        raise ConfigError(f"{key} must be [width, height], whole numbers of at least 16, got {list(size_px)}")

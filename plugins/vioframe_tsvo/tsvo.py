@@ -12,8 +12,9 @@ import numpy as np
 from vioframe.checks import Array, check_positive
 from vioframe.errors import ConfigError, DataError
 from vioframe.interfaces import FLOW, IMAGES
+from vioframe.learning.images import check_size
 from vioframe.types import RelativePose, SensorRig, VisualFeatures
-from vioframe_tsvo.estimator import LearnedVO, MotionOptions, check_size
+from vioframe_tsvo.estimator import LearnedVO, MotionOptions
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -179,10 +180,10 @@ class Tsvo(LearnedVO):
             )
         if batch.pairs < self._stack:
             raise DataError(f"windows have {batch.pairs} pairs of images, but vo.stack={self._stack} needs as many")
-        self.check_training_size("frontend.size_px", upstream[FLOW])
+        self.images.check_training_size("frontend.size_px", upstream[FLOW])
         stacks = stack_flows(upstream[FLOW] / self._flow_unit_px, self._stack)
         answered = stacks.shape[1]
-        pairs = self.pairs_of_batch(batch)[:, -answered:]
+        pairs = self.images.pairs_of_batch(batch.images)[:, -answered:]
         flat: MotionEstimate = self.net.get_submodule("motion")(pairs.flatten(0, 1), stacks.flatten(0, 1))
         shape = (len(batch), answered, 6)
         log_variances = None if flat.log_variances is None else flat.log_variances.reshape(shape)

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from vioframe.errors import ConfigError, ShapeError
-from vioframe.learning.flownet import LAYERS, PAIR_CHANNELS, FlowNetConvolutions
-from vioframe_tsvo.net.two_stream import MotionEstimate, MotionHead, centred, check_maps
+from vioframe.learning.flownet import LAYERS, PAIR_CHANNELS, FlowNetConvolutions, centred, check_maps
+from vioframe_tsvo.net.two_stream import MotionEstimate, MotionHead
 
 DEEPVO_LAYERS = LAYERS[:9]
 """The paper ends at Conv6."""

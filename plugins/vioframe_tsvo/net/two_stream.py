@@ -9,8 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from vioframe.errors import ConfigError, ShapeError
-from vioframe.learning.flownet import PAIR_CHANNELS, SpatialStream
+from vioframe.errors import ConfigError
+from vioframe.learning.flownet import PAIR_CHANNELS, SpatialStream, centred, check_maps
 from vioframe_tsvo.net.backbones import make_backbone
 
 MOTION = 6
@@ -133,28 +133,3 @@ def stack_flows(flow: Tensor, stack: int) -> Tensor:
     """
     windows = flow.unfold(1, stack, 1).permute(0, 1, 5, 2, 3, 4)
     return windows.reshape(*windows.shape[:2], 2 * stack, *windows.shape[-2:])
-
-
-def pairs_of(images: Tensor) -> Tensor:
-    """Neighbouring images (B, S, 6, H, W) of images in a row (B, S + 1, 3, H, W), or of one channel, repeated."""
-    if images.shape[2] == 1:
-        images = images.expand(-1, -1, 3, -1, -1)
-    return torch.cat([images[:, :-1], images[:, 1:]], dim=2)
-
-
-def centred(pair: Tensor) -> Tensor:
-    """Images of [0, 1] in [-1, 1]: without a mean that the first layer would have to learn away."""
-    return 2.0 * pair - 1.0
-
-
-def check_maps(what: str, maps: Tensor, channels: int, size_px: tuple[int, int]) -> None:
-    """Refuse maps (N, C, H, W) of another size than a net was built for.
-
-    Raises:
-        ShapeError: with what was expected and what came.
-    """
-    if maps.ndim != 4 or maps.shape[1] != channels or tuple(maps.shape[2:]) != size_px[::-1]:
-        raise ShapeError(
-            f"the net takes {what} of {channels} channels and {size_px[0]}×{size_px[1]} px, "
-            f"got an array of shape {tuple(maps.shape)} (number, channels, height, width)"
-        )

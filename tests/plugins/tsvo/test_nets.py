@@ -8,11 +8,11 @@ import torch
 
 from vioframe.errors import ConfigError, ShapeError
 from vioframe.learning.counting import size_of
-from vioframe.learning.flownet import FlowNetConvolutions, SpatialStream
+from vioframe.learning.flownet import FlowNetConvolutions, SpatialStream, pairs_of
 from vioframe.learning.losses import FixedWeights, GaussianLikelihood, LearnedWeights
 from vioframe_tsvo.net.backbones import BACKBONES
 from vioframe_tsvo.net.deepvo import DeepVoNet
-from vioframe_tsvo.net.two_stream import TwoStreamNet, pairs_of, stack_flows
+from vioframe_tsvo.net.two_stream import TwoStreamNet, stack_flows
 
 
 def test_spatial_stream_is_the_printed_table():
