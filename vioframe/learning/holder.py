@@ -94,7 +94,13 @@ class NetHolder:
             ConfigError: a GPU or a file of weights that is not there.
             DataError: the file of weights cannot be used.
         """
+        import torch
+
         self.net.to(self.device()).eval()
+        for parameter in self.net.parameters():
+            if parameter.ndim == 4:
+                # In a stream of single images a convolution spends its time on weights; so they are read as they lie.
+                parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
         if not self._taught:
             log.warning(
                 "%s=%s has no weights, so its answers are those of a random net: give %s.weights=FILE (task=train "
