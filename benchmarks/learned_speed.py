@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from vioframe.build import build_pipeline
+from vioframe.conventions import NANOSECONDS
 from vioframe.data.windows import StoredSequence, cut_window
 from vioframe.geometry import se3
 from vioframe.interfaces import Trainable
@@ -26,7 +27,7 @@ from vioframe.learning.training import Split, train_parts
 from vioframe.pipeline import Pipeline
 from vioframe.tasks.fitting import trainable_parts, trainer_options
 from vioframe.tracking import NullTracker
-from vioframe.types import Camera, Frame, ImuNoise, SensorRig, VisualFeatures
+from vioframe.types import Camera, Frame, ImuNoise, SensorRig, Trajectory, VisualFeatures
 
 PRECISIONS = ("32", "bf16", "16")
 _DTYPES = {"32": torch.float32, "bf16": torch.bfloat16, "16": torch.float16}
@@ -321,13 +322,18 @@ def _sequence(name: str, images: int, config: DictConfig) -> StoredSequence:
     shown = np.stack(_noise(min(images, 40), size))[np.arange(images) % min(images, 40)]
     poses = np.tile(np.eye(4), (images, 1, 1))
     poses[:, 2, 3] = np.arange(images)
+    stamps = _STEP_NS * np.arange(images, dtype=np.int64)
+    camera = _camera(size)
+    velocity = np.zeros((images, 3))
+    velocity[:, 2] = NANOSECONDS / _STEP_NS
     return StoredSequence(
         name=name,
         images=shown[..., : int(config.trainer.channels)],
-        stamps_ns=_STEP_NS * np.arange(images, dtype=np.int64),
+        stamps_ns=stamps,
         T_world_cam=poses,
         known=np.ones(images, dtype=np.bool_),
         imu=None,
-        camera=_camera(size),
+        camera=camera,
         gravity=9.81,
+        truth=Trajectory(stamps_ns=stamps, T_world_body=poses @ se3.inverse(camera.T_body_cam), v_world_body=velocity),
     )

@@ -20,6 +20,7 @@ def stored(scene: Scene | None = None, name: str = "scene") -> StoredSequence:
         imu=scene.imu,
         camera=camera,
         gravity=scene.rig.gravity,
+        truth=scene.truth,
     )
 
 

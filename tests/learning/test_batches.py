@@ -13,7 +13,7 @@ import torch
 
 from learned_parts import TinyVo, options
 from learned_scenes import stored
-from vioframe.data.windows import WindowIndex, cut_window
+from vioframe.data.windows import PairAnswers, WindowIndex, cut_window
 from vioframe.errors import ConfigError, ShapeError
 from vioframe.interfaces import Trainable
 from vioframe.learning.batch import collate
@@ -59,6 +59,26 @@ def test_missing_samples_are_masked():
     assert not batch.imu_mask[1].any()
     assert torch.equal(batch.imu[1], torch.zeros_like(batch.imu[1]))
     assert collate([without]).imu.shape == (1, 1, 0, 6)
+
+
+def test_answers_of_a_vo_travel_with_the_batch():
+    sequence = stored()
+    answers = PairAnswers(
+        T_prev_cur=sequence.motions(),
+        covariance=np.tile(np.eye(6), (len(sequence) - 1, 1, 1)),
+        valid=np.arange(len(sequence) - 1) % 2 == 0,
+    )
+    blind = replace(sequence, vo=answers, images=np.zeros((len(sequence), 0, 0, 1), dtype=np.uint8))
+    batch = collate([cut_window(blind, start, 3) for start in (0, 2)]).as_float().to("cpu")
+    assert batch.images.shape == (2, 4, 1, 0, 0)
+    assert batch.vo.valid.tolist() == [[True, False, True]] * 2
+    torch.testing.assert_close(batch.vo.T_prev_cur, batch.T_prev_cur)
+    assert batch.first().vo.covariance.shape == (1, 3, 6, 6)
+    assert batch.velocity_body.shape == batch.gravity_body.shape == (2, 4, 3)
+    with pytest.raises(ShapeError, match=r"WindowBatch.vo.valid must have shape \(2, 3\)"):
+        replace(batch, vo=replace(batch.vo, valid=batch.vo.valid[:, :1]))
+    with pytest.raises(ShapeError, match="answers of a VO, or none"):
+        collate([cut_window(blind, 0, 3), cut_window(replace(blind, vo=None), 0, 3)])
 
 
 def test_a_part_with_a_net_is_trainable_and_another_is_not():

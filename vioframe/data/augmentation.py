@@ -3,10 +3,12 @@
 Geometric ones change motion, inertial samples and calibration with the images, exactly:
 
 - reversed: time runs backwards. With t' = t_first + t_last - t the motion of a pair becomes its inverse, rotation rates
-  change sign and specific force, being even in time, does not;
+  and velocities change sign and specific force, being even in time, does not; an error n of a VO's motion, T Exp(n), is
+  -Ad(T) n of the inverse;
 - mirrored left to right: with M = diag(-1, 1, 1) in the camera, ``T' = M T M`` (on the 4×4 matrix, M acts on the first
   three axes). The body is mirrored at the same plane, by B = R_bc M R_bcᵀ, so that its mounting keeps its rotation,
-  ``T'_body_cam = (R_bc, B p)``; specific force, a vector, becomes B a, and rotation rate, an axial one, -B ω.
+  ``T'_body_cam = (R_bc, B p)``; specific force, velocity and gravity, vectors, become B a, and rotation rate, an axial
+  one, -B ω; an error (φ, ρ) of a VO's motion becomes (-M φ, M ρ).
 
 The others change pixels only: Gaussian blur and salt and pepper as in Zhao et al. 2022, and brightness, contrast and
 gamma, which a window shares, since a camera's exposure changes slowly.
@@ -19,7 +21,7 @@ import cv2
 import numpy as np
 
 from vioframe.checks import Array, check_not_negative
-from vioframe.data.windows import TrainingWindow
+from vioframe.data.windows import PairAnswers, TrainingWindow
 from vioframe.errors import ConfigError
 from vioframe.geometry import se3
 from vioframe.types import Image
@@ -115,6 +117,8 @@ class Augmentation:
         if draws[1] < self._mirror:
             window = mirrored_window(window)
         images = window.images
+        if not images.size:
+            return window
         if draws[2] < self._photometric:
             images = toned(
                 images, 1.0 + self._brightness * tone[0], 1.0 + self._contrast * tone[1], np.exp(self._gamma * tone[2])
@@ -137,6 +141,17 @@ def reversed_window(window: TrainingWindow) -> TrainingWindow:
         T_prev_cur=se3.inverse(window.T_prev_cur[::-1]),
         imu=tuple(samples[::-1] * sign for samples in reversed(window.imu)),
         imu_time_s=tuple(times[-1] - times[::-1] if len(times) else times for times in reversed(window.imu_time_s)),
+        velocity_body=-window.velocity_body[::-1],
+        gravity_body=window.gravity_body[::-1],
+        vo=None if window.vo is None else _reversed_answers(window.vo),
+    )
+
+
+def _reversed_answers(answers: PairAnswers) -> PairAnswers:
+    into_earlier = se3.adjoint(answers.T_prev_cur)
+    covariance = into_earlier @ answers.covariance @ np.swapaxes(into_earlier, 1, 2)
+    return PairAnswers(
+        T_prev_cur=se3.inverse(answers.T_prev_cur[::-1]), covariance=covariance[::-1], valid=answers.valid[::-1]
     )
 
 
@@ -158,6 +173,16 @@ def mirrored_window(window: TrainingWindow) -> TrainingWindow:
         imu=tuple(np.concatenate([-samples[:, :3] @ B.T, samples[:, 3:] @ B.T], axis=1) for samples in window.imu),
         intrinsics_px=intrinsics,
         T_body_cam=T_body_cam,
+        velocity_body=window.velocity_body @ B.T,
+        gravity_body=window.gravity_body @ B.T,
+        vo=None if window.vo is None else _mirrored_answers(window.vo, M),
+    )
+
+
+def _mirrored_answers(answers: PairAnswers, M: Array) -> PairAnswers:
+    signs = np.concatenate([-np.diag(_MIRROR), np.diag(_MIRROR)])
+    return replace(
+        answers, T_prev_cur=M @ answers.T_prev_cur @ M, covariance=signs[:, None] * answers.covariance * signs
     )
 
 

@@ -28,12 +28,12 @@ from vioframe.checks import Array, Mask, Stamps
 from vioframe.data.recording import CORRUPT_IMAGES, Recording
 from vioframe.data.windows import StoredSequence
 from vioframe.errors import ConfigError, DataError, VioframeError
-from vioframe.geometry.interpolation import interpolate_poses
-from vioframe.types import Camera, Frame, Image, ImuBlock
+from vioframe.geometry.interpolation import differentiate_positions, interpolate_poses
+from vioframe.types import Camera, Frame, Image, ImuBlock, Trajectory
 
 log = logging.getLogger(__name__)
 
-_FORMAT = 1
+_FORMAT = 2
 # Frames whose pixels are part of the key: enough to notice that a folder's images were exchanged.
 _FRAMES_IN_KEY = 3
 # Truth between poses further apart than this is not invented (as in evaluation.max_gap_s).
@@ -221,6 +221,9 @@ class SequenceCache:
             "distortion": camera.distortion,
             "T_body_cam": camera.T_body_cam,
             "gravity": np.array(recording.rig.gravity),
+            "truth_stamps_ns": truth.stamps_ns,
+            "T_world_body": truth.T_world_body,
+            "v_world_body": differentiate_positions(truth),
         }
 
 
@@ -262,6 +265,11 @@ def read_stored(folder: Path) -> tuple[StoredSequence, str]:
                 T_body_cam=arrays["T_body_cam"],
             ),
             gravity=float(arrays["gravity"]),
+            truth=Trajectory(
+                stamps_ns=arrays["truth_stamps_ns"],
+                T_world_body=arrays["T_world_body"],
+                v_world_body=arrays["v_world_body"],
+            ),
         )
         return sequence, str(manifest["sha256"])
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, VioframeError) as error:

@@ -1,13 +1,14 @@
 """From a recording to windows of consecutive images for training: numpy only, and no truth for any estimator.
 
 A :class:`StoredSequence` holds one recording as training needs it: decoded images of camera 0 at the size of the net,
-the inertial samples between them, and the true motion of the camera. :class:`WindowIndex` says where windows may
-begin: nowhere across a missing image or where the truth is unknown. Splits are made of whole recordings.
+the inertial samples between them, and the true motion of the camera. A fuser learns from what a VO answered instead
+(:class:`PairAnswers`), and needs no images. :class:`WindowIndex` says where windows may begin: nowhere across a missing
+image or where the truth is unknown. Splits are made of whole recordings.
 """
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -16,10 +17,41 @@ from vioframe.checks import Array, Mask, Stamps, check_array, check_increasing, 
 from vioframe.conventions import NANOSECONDS
 from vioframe.errors import ConfigError, DataError, ShapeError
 from vioframe.geometry import se3
-from vioframe.types import Camera, Image, ImuBlock
+from vioframe.geometry.interpolation import differentiate_positions
+from vioframe.types import Camera, Image, ImuBlock, Trajectory
 
 # A pair further apart than this many usual intervals is not two consecutive images: some are missing between them.
 _LONGEST_STEP = 1.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PairAnswers:
+    """What a VO answered for P pairs of consecutive images.
+
+    Attributes:
+        T_prev_cur: (P, 4, 4) motion of camera 0, metres; the identity where it is not valid.
+        covariance: (P, 6, 6) in the tangent (rotation, translation) at the later image; zero where none was stated.
+        valid: (P,) whether the VO stands by its answer.
+    """
+
+    T_prev_cur: Array
+    covariance: Array
+    valid: Mask
+
+    def __post_init__(self) -> None:
+        count = len(self.valid)
+        check_array("PairAnswers.valid", self.valid, (count,), np.bool_)
+        check_array("PairAnswers.T_prev_cur", self.T_prev_cur, (count, 4, 4))
+        check_array("PairAnswers.covariance", self.covariance, (count, 6, 6))
+        check_pose("PairAnswers.T_prev_cur", self.T_prev_cur, tolerance=1e-4)
+
+    def __len__(self) -> int:
+        return len(self.valid)
+
+    def cut(self, start: int, stop: int) -> Self:
+        """Those of pairs ``start`` to ``stop - 1``."""
+        kept = slice(start, stop)
+        return replace(self, T_prev_cur=self.T_prev_cur[kept], covariance=self.covariance[kept], valid=self.valid[kept])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,13 +60,16 @@ class StoredSequence:
 
     Attributes:
         name: of the sequence.
-        images: (F, H, W, C) uint8, C = 1 or 3 (RGB), of camera 0; may be mapped from disk.
+        images: (F, H, W, C) uint8, C = 1 or 3 (RGB), of camera 0; may be mapped from disk; (F, 0, 0, 1) where none are
+            needed.
         stamps_ns: (F,) IMU clock.
         T_world_cam: (F, 4, 4) true poses of camera 0; the identity where unknown.
         known: (F,) whether the pose is known.
         imu: samples around and between the images, or None.
         camera: camera 0 as it is after resizing.
         gravity: m/s².
+        truth: poses and velocities of the body, as closely spaced as they are known.
+        vo: what a VO answered for the F - 1 pairs, or None.
     """
 
     name: str
@@ -45,6 +80,8 @@ class StoredSequence:
     imu: ImuBlock | None
     camera: Camera
     gravity: float
+    truth: Trajectory
+    vo: PairAnswers | None = None
 
     def __post_init__(self) -> None:
         count = len(self.stamps_ns)
@@ -54,6 +91,10 @@ class StoredSequence:
         check_array("StoredSequence.T_world_cam", self.T_world_cam, (count, 4, 4))
         check_pose("StoredSequence.T_world_cam", self.T_world_cam, tolerance=1e-4)
         check_increasing("StoredSequence.stamps_ns", self.stamps_ns)
+        if self.truth.v_world_body is None:
+            raise ShapeError("StoredSequence.truth must have velocities; differentiate_positions makes some")
+        if self.vo is not None and len(self.vo) != count - 1:
+            raise ShapeError(f"StoredSequence.vo must answer for {count - 1} pairs, got {len(self.vo)}")
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -86,6 +127,9 @@ class TrainingWindow:
         intrinsics_px: (4,) fx, fy, cx, cy.
         T_body_cam: (4, 4).
         gravity: m/s².
+        velocity_body: (S + 1, 3) m/s, true velocity of the body at the images, in the body.
+        gravity_body: (S + 1, 3) m/s², true gravity, which points down, in the body.
+        vo: what a VO answered for the pairs, or None.
         recording: number of the recording in the split.
         start: number of the first image in the recording.
     """
@@ -98,6 +142,9 @@ class TrainingWindow:
     intrinsics_px: Array
     T_body_cam: Array
     gravity: float
+    velocity_body: Array
+    gravity_body: Array
+    vo: PairAnswers | None = None
     recording: int = 0
     start: int = 0
 
@@ -110,38 +157,67 @@ class TrainingWindow:
 def cut_window(sequence: StoredSequence, start: int, pairs: int, recording: int = 0) -> TrainingWindow:
     """The window of ``pairs`` pairs that begins at image ``start``; its images are a copy."""
     stop = start + pairs + 1
-    stamps = sequence.stamps_ns[start:stop]
+    stamps = sequence.stamps_ns[start:stop].astype(np.int64)
     poses = sequence.T_world_cam[start:stop]
-    blocks = [_between(sequence.imu, int(a), int(b)) for a, b in itertools.pairwise(stamps)]
+    samples, times = samples_between(sequence.imu, stamps)
+    velocity, gravity = states_in_body(sequence, stamps, poses)
     return TrainingWindow(
         images=np.array(sequence.images[start:stop]),
-        stamps_ns=stamps.astype(np.int64),
+        stamps_ns=stamps,
         T_prev_cur=se3.inverse(poses[:-1]) @ poses[1:],
-        imu=tuple(samples for samples, _ in blocks),
-        imu_time_s=tuple(times for _, times in blocks),
+        imu=samples,
+        imu_time_s=times,
         intrinsics_px=sequence.camera.intrinsics_px,
         T_body_cam=sequence.camera.T_body_cam,
         gravity=sequence.gravity,
+        velocity_body=velocity,
+        gravity_body=gravity,
+        vo=None if sequence.vo is None else sequence.vo.cut(start, stop - 1),
         recording=recording,
         start=start,
     )
 
 
-def _between(imu: ImuBlock | None, first_ns: int, last_ns: int) -> tuple[Array, Array]:
-    """Samples (N, 6), times (N,) s, with one exactly at both ends, interpolated; none beyond the samples there are."""
-    if imu is None or len(imu) < 2 or imu.stamps_ns[0] > first_ns or imu.stamps_ns[-1] < last_ns:
-        return np.zeros((0, 6)), np.zeros(0)
-    inner = slice(
-        int(np.searchsorted(imu.stamps_ns, first_ns, side="right")), int(np.searchsorted(imu.stamps_ns, last_ns))
-    )
-    stamps = np.concatenate([[first_ns], imu.stamps_ns[inner], [last_ns]])
-    # Relative to the pair before they become floats: absolute nanoseconds would lose digits.
-    around = slice(max(inner.start - 1, 0), inner.stop + 1)
-    known_s = (imu.stamps_ns[around] - first_ns) / NANOSECONDS
-    time_s = (stamps - first_ns) / NANOSECONDS
+def states_in_body(sequence: StoredSequence, stamps_ns: Stamps, T_world_cam: Array) -> tuple[Array, Array]:
+    """True velocity (K, 3) m/s and gravity (K, 3) m/s² in the body, at stamps and poses of the camera (K,…)."""
+    truth = sequence.truth
+    # Relative to the first before they become floats: absolute nanoseconds would lose digits.
+    at_s, known_s = stamps_ns - stamps_ns[0], truth.stamps_ns - stamps_ns[0]
+    v_world = np.stack([np.interp(at_s, known_s, axis) for axis in differentiate_positions(truth).T], axis=1)
+    R_body_world = sequence.camera.T_body_cam[:3, :3] @ np.swapaxes(T_world_cam[:, :3, :3], 1, 2)
+    return np.einsum("kij,kj->ki", R_body_world, v_world), -sequence.gravity * R_body_world[:, :, 2]
+
+
+def samples_between(imu: ImuBlock | None, stamps_ns: Stamps) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Samples (N, 6) and times (N,) s of each pair of consecutive stamps (K,), one exactly at both, interpolated.
+
+    Times are since the pair's first stamp. A pair that lies partly beyond the samples there are has N = 0.
+    """
+    pairs = len(stamps_ns) - 1
+    nothing = np.zeros((0, 6)), np.zeros(0)
+    if imu is None or len(imu) < 2:
+        return (nothing[0],) * pairs, (nothing[1],) * pairs
+    first, last = np.searchsorted(imu.stamps_ns, stamps_ns[[0, -1]])
+    around = slice(max(int(first) - 1, 0), int(last) + 1)
     values = np.concatenate([imu.gyro[around], imu.accel[around]], axis=1)
-    samples = np.stack([np.interp(time_s, known_s, values[:, axis]) for axis in range(6)], axis=1)
-    return samples, time_s
+    known_ns = imu.stamps_ns[around]
+    if len(known_ns) < 2:
+        return (nothing[0],) * pairs, (nothing[1],) * pairs
+    # Relative to the window before they become floats: absolute nanoseconds would lose digits.
+    known_s, at_s = (known_ns - stamps_ns[0]) / NANOSECONDS, (stamps_ns - stamps_ns[0]) / NANOSECONDS
+    at_images = np.stack([np.interp(at_s, known_s, axis) for axis in values.T], axis=1)
+    other = ~np.isin(known_ns, stamps_ns)
+    known_s, values = known_s[other], values[other]
+    places = np.searchsorted(known_s, at_s)
+    values, time_s = np.insert(values, places, at_images, axis=0), np.insert(known_s, places, at_s)
+    places = places + np.arange(len(places))
+    covered = (stamps_ns >= known_ns[0]) & (stamps_ns <= known_ns[-1])
+    samples, times = [], []
+    for pair in range(pairs):
+        block = slice(places[pair], places[pair + 1] + 1) if covered[pair] and covered[pair + 1] else slice(0)
+        samples.append(values[block])
+        times.append(time_s[block] - at_s[pair])
+    return tuple(samples), tuple(times)
 
 
 class WindowIndex:

@@ -6,7 +6,7 @@ what belongs to an image S + 1.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -32,12 +32,27 @@ class RigBatch:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class VisualBatch:
+    """What a VO answered for the pairs of each window, with fields as of :class:`vioframe.data.windows.PairAnswers`.
+
+    Attributes:
+        T_prev_cur: (B, S, 4, 4) motion of camera 0, metres.
+        covariance: (B, S, 6, 6), zero where none was stated.
+        valid: (B, S) bool.
+    """
+
+    T_prev_cur: Tensor
+    covariance: Tensor
+    valid: Tensor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WindowBatch:
     """B windows of S pairs of consecutive images of camera 0.
 
     Attributes:
         images: (B, S + 1, C, H, W), C = 1 or 3 (RGB). Floating point in [0, 1] where a net sees them; uint8 on the
-            way to the device, see :meth:`as_float`.
+            way to the device, see :meth:`as_float`. H = W = 0 where nothing that is trained sees images.
         T_prev_cur: (B, S, 4, 4) true motion of camera 0 over each pair, metres: the target.
         stamps_ns: (B, S + 1) int64, IMU clock (mirrored in time where a window was reversed).
         imu: (B, S, N, 6) gyro rad/s and specific force m/s² in the body; the first and the last valid sample of a pair
@@ -45,6 +60,9 @@ class WindowBatch:
         imu_time_s: (B, S, N) seconds since the first image of the pair.
         imu_mask: (B, S, N) bool, True for a sample, False for padding, which follows the samples.
         rig: calibration.
+        velocity_body: (B, S + 1, 3) m/s, true velocity of the body at the images, in the body.
+        gravity_body: (B, S + 1, 3) m/s², true gravity, which points down, in the body.
+        vo: what a VO answered for the pairs, or None where it is trained or asked along.
         recording: (B,) int64, which recording of the split.
         start: (B,) int64, number of the window's first image among the recording's frames.
     """
@@ -56,8 +74,11 @@ class WindowBatch:
     imu_time_s: Tensor
     imu_mask: Tensor
     rig: RigBatch
+    velocity_body: Tensor
+    gravity_body: Tensor
     recording: Tensor
     start: Tensor
+    vo: VisualBatch | None = None
 
     def __post_init__(self) -> None:
         if self.images.ndim != 5 or self.images.shape[1] < 2 or self.images.shape[2] not in (1, 3):
@@ -78,9 +99,15 @@ class WindowBatch:
             "rig.intrinsics_px": (self.rig.intrinsics_px, (count, 4)),
             "rig.T_body_cam": (self.rig.T_body_cam, (count, 4, 4)),
             "rig.gravity": (self.rig.gravity, (count,)),
+            "velocity_body": (self.velocity_body, (count, pairs + 1, 3)),
+            "gravity_body": (self.gravity_body, (count, pairs + 1, 3)),
             "recording": (self.recording, (count,)),
             "start": (self.start, (count,)),
         }
+        if self.vo is not None:
+            wanted["vo.T_prev_cur"] = (self.vo.T_prev_cur, (count, pairs, 4, 4))
+            wanted["vo.covariance"] = (self.vo.covariance, (count, pairs, 6, 6))
+            wanted["vo.valid"] = (self.vo.valid, (count, pairs))
         for name, (value, shape) in wanted.items():
             if tuple(value.shape) != shape:
                 raise ShapeError(f"WindowBatch.{name} must have shape {shape}, got {tuple(value.shape)}")
@@ -112,9 +139,18 @@ class WindowBatch:
         return self._map(lambda tensor: tensor.pin_memory())
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> Self:
-        rig = replace(self.rig, **{each.name: change(getattr(self.rig, each.name)) for each in fields(self.rig)})
-        moved = {each.name: change(getattr(self, each.name)) for each in fields(self) if each.name != "rig"}
-        return replace(self, **moved, rig=rig)
+        moved = {
+            each.name: _changed(getattr(self, each.name), change)
+            for each in fields(self)
+            if getattr(self, each.name) is not None
+        }
+        return replace(self, **moved)
+
+
+def _changed(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    if isinstance(value, Tensor):
+        return change(value)
+    return replace(value, **{each.name: change(getattr(value, each.name)) for each in fields(value)})
 
 
 def collate(windows: Sequence[TrainingWindow]) -> WindowBatch:
@@ -124,7 +160,7 @@ def collate(windows: Sequence[TrainingWindow]) -> WindowBatch:
         windows: at least one, all with the same number of images and the same image size.
 
     Raises:
-        ShapeError: sizes differ.
+        ShapeError: sizes differ, or some windows have the answers of a VO and others have not.
     """
     shapes = {window.images.shape for window in windows}
     if len(shapes) != 1:
@@ -141,6 +177,9 @@ def collate(windows: Sequence[TrainingWindow]) -> WindowBatch:
             mask[index, pair, : len(times)] = True
     # Images are kept with channels last, as they are decoded; a convolution wants them before height and width.
     images = np.stack([window.images for window in windows]).transpose(0, 1, 4, 2, 3)
+    answers = [window.vo for window in windows if window.vo is not None]
+    if answers and len(answers) != count:
+        raise ShapeError("windows of one batch must all have the answers of a VO, or none of them")
     return WindowBatch(
         images=torch.from_numpy(np.ascontiguousarray(images)),
         T_prev_cur=_floats([window.T_prev_cur for window in windows]),
@@ -153,6 +192,15 @@ def collate(windows: Sequence[TrainingWindow]) -> WindowBatch:
             T_body_cam=_floats([window.T_body_cam for window in windows]),
             gravity=torch.tensor([window.gravity for window in windows], dtype=torch.float32),
         ),
+        velocity_body=_floats([window.velocity_body for window in windows]),
+        gravity_body=_floats([window.gravity_body for window in windows]),
+        vo=VisualBatch(
+            T_prev_cur=_floats([each.T_prev_cur for each in answers]),
+            covariance=_floats([each.covariance for each in answers]),
+            valid=torch.from_numpy(np.stack([each.valid for each in answers])),
+        )
+        if answers
+        else None,
         recording=torch.tensor([window.recording for window in windows], dtype=torch.int64),
         start=torch.tensor([window.start for window in windows], dtype=torch.int64),
     )

@@ -116,6 +116,8 @@ def _blank_batch(pairs: int, width: int, height: int, device: "torch.device") ->
                 T_body_cam=torch.eye(4)[None],
                 gravity=torch.full((1,), 9.81),
             ),
+            velocity_body=torch.zeros(1, images, 3),
+            gravity_body=torch.tensor([0.0, 0.0, -9.81]).expand(1, images, 3),
             recording=torch.zeros(1, dtype=torch.int64),
             start=torch.zeros(1, dtype=torch.int64),
         )

@@ -70,10 +70,15 @@ class TrainingModule(lightning.LightningModule):
     def run_parts(self, batch: WindowBatch) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """What all parts return, by name, and their losses as ``slot/name``, with the sum as ``loss``.
 
+        Where the batch brings what a VO answered, that stands in for the parts before the first one: ``"T_prev_cur"``,
+        ``"covariance"`` and ``"valid"``.
+
         Raises:
             ConfigError: no part that is trained has a loss.
         """
         known: dict[str, Tensor] = {}
+        if batch.vo is not None:
+            known = {MOTION: batch.vo.T_prev_cur, "covariance": batch.vo.covariance, "valid": batch.vo.valid}
         losses: dict[str, Tensor] = {}
         total: Tensor | None = None
         for slot, part in self._parts.items():

@@ -7,10 +7,11 @@ import pytest
 
 from learned_scenes import stored
 from vioframe.data import augmentation
-from vioframe.data.windows import WindowIndex, check_split, cut_window
-from vioframe.errors import ConfigError, DataError
-from vioframe.geometry import so3
+from vioframe.data.windows import PairAnswers, WindowIndex, check_split, cut_window
+from vioframe.errors import ConfigError, DataError, ShapeError
+from vioframe.geometry import se3, so3
 from vioframe.geometry.camera import project
+from vioframe.types import ImuBlock
 
 OFF = {
     "reverse": 0.0,
@@ -147,6 +148,76 @@ def test_mirrored_gyro_integrates_to_the_mirrored_motion_and_gravity_stays_as_st
         np.testing.assert_allclose(R, body_motion(window, pair)[:3, :3], atol=1e-5)
         lengths = np.linalg.norm(window.imu[pair][:, 3:], axis=1)
         np.testing.assert_allclose(lengths, np.linalg.norm(plain.imu[pair][:, 3:], axis=1))
+
+
+def answered(sequence, seed=0):
+    """The sequence with what a VO answered: true motions with an error of the covariance that it states."""
+    rng = np.random.default_rng(seed)
+    count = len(sequence) - 1
+    roots = 0.01 * rng.standard_normal((count, 6, 6))
+    errors = np.einsum("kij,kj->ki", roots, rng.standard_normal((count, 6)))
+    answers = PairAnswers(
+        T_prev_cur=sequence.motions() @ se3.exp(errors),
+        covariance=roots @ roots.transpose(0, 2, 1),
+        valid=rng.uniform(size=count) < 0.8,
+    )
+    return replace(sequence, vo=answers)
+
+
+def mahalanobis(window):
+    """Of the VO's errors, in the units of what it states."""
+    errors = se3.log(se3.inverse(window.T_prev_cur) @ window.vo.T_prev_cur)
+    return np.einsum("ki,kij,kj->k", errors, np.linalg.inv(window.vo.covariance), errors)
+
+
+def test_a_window_holds_what_the_vo_answered():
+    sequence = answered(stored())
+    window = cut_window(sequence, 3, 4)
+    np.testing.assert_array_equal(window.vo.T_prev_cur, sequence.vo.T_prev_cur[3:7])
+    np.testing.assert_array_equal(window.vo.valid, sequence.vo.valid[3:7])
+    with pytest.raises(ShapeError, match="must answer for 11 pairs, got 5"):
+        replace(sequence, vo=sequence.vo.cut(0, 5))
+
+
+def test_reversed_and_mirrored_answers_err_as_they_did():
+    window = cut_window(answered(stored()), 2, 5)
+    for change, order in ((augmentation.reversed_window, -1), (augmentation.mirrored_window, 1)):
+        changed = change(window)
+        np.testing.assert_allclose(mahalanobis(changed), mahalanobis(window)[::order], rtol=1e-4)
+        np.testing.assert_array_equal(changed.vo.valid, window.vo.valid[::order])
+        again = change(changed)
+        np.testing.assert_allclose(again.vo.covariance, window.vo.covariance, atol=1e-12)
+        np.testing.assert_allclose(again.vo.T_prev_cur, window.vo.T_prev_cur, atol=1e-12)
+
+
+@pytest.mark.parametrize("change", [lambda same: same, augmentation.reversed_window, augmentation.mirrored_window])
+def test_velocity_gravity_and_specific_force_agree(change):
+    """v' = a + g - ω × v in the body, whichever way time runs and however space is mirrored."""
+    window = change(cut_window(stored(), 2, 6))
+    assert np.linalg.norm(window.gravity_body, axis=1) == pytest.approx(9.81)
+    for pair in range(6):
+        samples, times = window.imu[pair], window.imu_time_s[pair]
+        R = body_motion(window, pair)[:3, :3]
+        increment, turned = np.zeros(3), np.eye(3)
+        for a, b, step in zip(samples[:-1], samples[1:], np.diff(times), strict=True):
+            middle = turned @ so3.exp(0.25 * step * (a[:3] + b[:3]))
+            increment += step * middle @ (0.5 * (a[3:] + b[3:]))
+            turned = turned @ so3.exp(0.5 * step * (a[:3] + b[:3]))
+        after = window.velocity_body[pair] + window.gravity_body[pair] * times[-1] + increment
+        np.testing.assert_allclose(R @ window.velocity_body[pair + 1], after, atol=2e-4)
+        np.testing.assert_allclose(R @ window.gravity_body[pair + 1], window.gravity_body[pair], atol=1e-6)
+
+
+def test_samples_are_cut_where_they_are_known():
+    sequence = stored()
+    half, imu = len(sequence.imu) // 2, sequence.imu
+    short = replace(
+        sequence, imu=ImuBlock(stamps_ns=imu.stamps_ns[:half], gyro=imu.gyro[:half], accel=imu.accel[:half])
+    )
+    window = cut_window(short, 0, len(sequence) - 1)
+    covered = sequence.stamps_ns[1:] <= short.imu.stamps_ns[-1]
+    assert 0 < covered.sum() < len(covered)
+    assert [len(block) > 0 for block in window.imu] == covered.tolist()
 
 
 def test_switched_off_changes_nothing():

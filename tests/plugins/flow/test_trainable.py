@@ -35,6 +35,8 @@ def batch_of(*windows) -> WindowBatch:
             T_body_cam=torch.eye(4).expand(count, 4, 4),
             gravity=torch.full((count,), 9.81),
         ),
+        velocity_body=torch.zeros(count, pairs + 1, 3),
+        gravity_body=torch.zeros(count, pairs + 1, 3),
         recording=torch.zeros(count, dtype=torch.int64),
         start=torch.arange(count),
     ).as_float()
