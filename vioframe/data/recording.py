@@ -59,6 +59,13 @@ class Recording(ABC):
         """True poses of the body (IMU clock, world with z up), or None."""
         return None
 
+    def seen_truth(self) -> Trajectory | None:
+        """The truth for parts that simulate a camera from it: ``T_world_body @ T_body_cam``, as told, is where it was.
+
+        It is the ground truth, unless the calibration was spoilt on purpose.
+        """
+        return self.ground_truth()
+
     def findings(self) -> list[Finding]:
         """What the checks found, good and bad, for ``task=doctor``."""
         return []

@@ -6,6 +6,7 @@ import numpy as np
 
 from vioframe.checks import Array
 from vioframe.conventions import seconds
+from vioframe.data.exposure import exposure_ns
 from vioframe.errors import ConfigError, StateError
 from vioframe.geometry import se3
 from vioframe.geometry.interpolation import interpolate_poses
@@ -85,7 +86,7 @@ class SimulatedVO(VOEstimator):
         self._truth = trajectory
 
     def estimate(self, previous: VisualFeatures, current: VisualFeatures) -> RelativePose:
-        """The noisy motion between the stamps of the two frames (IMU clock).
+        """The noisy motion between the instants of the two frames, whatever their stamps say.
 
         Raises:
             StateError: the truth was never given.
@@ -95,7 +96,7 @@ class SimulatedVO(VOEstimator):
                 "vo=simulated has no ground truth: choose a dataset that has one, "
                 "or call take_ground_truth(trajectory) after setup"
             )
-        stamps = np.array([previous.frame.stamp_ns, current.frame.stamp_ns])
+        stamps = np.array([exposure_ns(previous.frame), exposure_ns(current.frame)])
         poses, covered = interpolate_poses(self._truth, stamps, max_gap_ns=_MAX_GAP_NS)
         # Drawn in any case, so that a lost motion does not change the noise of the others.
         draws = self._rng.standard_normal(7)

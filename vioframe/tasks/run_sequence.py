@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from vioframe.conventions import NANOSECONDS
+from vioframe.data.exposure import with_exposures
 from vioframe.data.recording import Recording, prefetch
 from vioframe.errors import ConfigError, VioframeError
 from vioframe.evaluation.run import SampleFrame, SequenceRun
@@ -128,7 +129,7 @@ def run_sequence(
     wanted = [int((k + 0.5) * expected / max(sample_count, 1)) for k in range(sample_count)]
     started = time.perf_counter()
     pipeline.setup(recording.rig, initial_state(init, truth, recording.name))
-    users = lend_ground_truth(pipeline, truth, recording.name)
+    users = lend_ground_truth(pipeline, recording.seen_truth(), recording.name)
     if viewer is not None:
         viewer.setup(recording.name, recording.rig, truth, folder)
     recorder = Recorder(folder, recording.name, wanted, progress)
@@ -136,7 +137,8 @@ def run_sequence(
     for observer in observers:
         pipeline.observe(observer)
     stop: BaseException | None = None
-    packets = prefetch(recording.packets())
+    delivered = recording.packets()
+    packets = prefetch(with_exposures(delivered, recording.rig.camera_delay_ns) if users else delivered)
     try:
         _drive(pipeline, packets, recorder)
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - kept, and raised again by the caller
