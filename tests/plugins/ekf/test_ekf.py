@@ -14,10 +14,10 @@ from vioframe.fusion_options import InertialOptions, StandstillOptions, StartOpt
 from vioframe.geometry import se3, so3
 from vioframe.initialisation import initial_covariance
 from vioframe.loose_fusion import VisualMotion
+from vioframe.metric_fusion import relative_pose_measurement
 from vioframe.testing import check_component
 from vioframe.types import ImuBias, ImuBlock, ImuNoise, InertialDelta, NavState, RelativePose, SensorRig
 from vioframe_ekf import EkfFuser
-from vioframe_ekf.fuser import relative_pose_measurement
 from vioframe_preintegration import Preintegration
 
 NOISE = ImuNoise(gyro_noise=2e-4, gyro_walk=2e-5, accel_noise=2e-3, accel_walk=3e-3, rate_hz=200.0)
