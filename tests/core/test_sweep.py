@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
@@ -131,6 +132,20 @@ def test_the_best_is_the_best_of_those_that_finished() -> None:
     winners = re.findall(r"\x1b\[1;32m *([0-9.]+)", printed(jobs))
     # Every job completes alike, and nobody wins that.
     assert winners == ["0.500"]
+
+
+def test_jobs_on_different_recordings_are_not_compared_in_silence(tmp_path: Path) -> None:
+    for number, (fuser, name) in enumerate((("ekf", "walk"), ("msf", "car-0"))):
+        sequences = {"sequences": [{"sequence": name, "status": "finished", ATE: 1.0}]}
+        leave_job(tmp_path, number, f"fuser={fuser}", document=sequences)
+    jobs = collect(tmp_path)
+    said = "#0 on walk; #1 on car-0"
+    assert said in " ".join(printed(jobs).split())
+    assert said in markdown_table(summarise(jobs))
+    # What was asked for needs no word, nor does what is the same.
+    asked = [replace(each, overrides=(f"dataset.sequence={each.recordings[0]}",)) for each in jobs]
+    assert not summarise(asked).caution()
+    assert not summarise([replace(each, recordings=("walk",)) for each in jobs]).caution()
 
 
 def test_messages_are_shown_as_they_are() -> None:

@@ -23,6 +23,7 @@ class JobResult:
         error: one sentence, for all but ``finished``.
         metrics: what ``metrics_of`` finds in its ``metrics.json``; a failed job may have some.
         folder: where its files are; ``None`` if it never started.
+        recordings: names of those it ran on.
     """
 
     number: int
@@ -31,6 +32,7 @@ class JobResult:
     error: str = ""
     metrics: dict[str, float] = field(default_factory=dict)
     folder: Path | None = None
+    recordings: tuple[str, ...] = ()
 
 
 def write_job(folder: Path, number: int, overrides: list[str]) -> None:
@@ -98,7 +100,13 @@ def _read_job(path: Path) -> JobResult:
         error=error,
         metrics=metrics_of(document) if document else {},
         folder=folder,
+        recordings=_recordings_of(document),
     )
+
+
+def _recordings_of(document: dict[str, object] | None) -> tuple[str, ...]:
+    rows = (document or {}).get("sequences")
+    return tuple(str(row["sequence"]) for row in rows if "sequence" in row) if isinstance(rows, list) else ()
 
 
 def _read_status(folder: Path, document: dict[str, object] | None) -> tuple[str, str]:

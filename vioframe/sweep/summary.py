@@ -100,6 +100,20 @@ class Summary:
             or (column.nets in (None, nets) and any(column.key in job.metrics for job in self.jobs))
         ]
 
+    def caution(self) -> str:
+        """Return a sentence where jobs ran on different recordings without having been asked to; else nothing."""
+        ran: dict[tuple[str, ...], list[str]] = {}
+        for job in self.jobs:
+            if job.recordings:
+                ran.setdefault(job.recordings, []).append(f"#{job.number}")
+        if len(ran) < 2 or any(key.partition(".")[0] == "dataset" for key in self.varied):
+            return ""
+        told = "; ".join(f"{', '.join(numbers)} on {', '.join(names)}" for names, numbers in ran.items())
+        return (
+            f"Parts of these jobs brought data of their own ({told}), so rows on different recordings do not compare: "
+            "choose dataset=, or vo= and its backbone=, for all of them"
+        )
+
     def metrics(self) -> dict[str, float]:
         """Return what the sweep's own record shows: counts, and the best of each column."""
         numbers = {

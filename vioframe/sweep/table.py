@@ -44,6 +44,8 @@ def print_table(summary: Summary, console: "Console | None" = None) -> None:
     console.print(table)
     if summary.groups:
         console.print(_seed_table(summary, columns))
+    if summary.caution():
+        console.print(Text(summary.caution(), style="yellow"))
 
 
 def _seed_table(summary: Summary, columns: Sequence[Column]) -> object:
@@ -101,6 +103,8 @@ def markdown_table(summary: Summary) -> str:
             spreads = [_spread(group, column) for column in columns]
             counted = f"{group.finished} of {group.jobs}"
             lines.append(_markdown_row([summary.label(group.choices), *spreads, counted]))
+    if summary.caution():
+        lines += ["", summary.caution()]
     return "\n".join(lines)
 
 
