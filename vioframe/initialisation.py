@@ -131,6 +131,9 @@ class StillnessDetector:
     def push(self, window: SyncedWindow) -> Stillness | None:
         """Take the next window; measure the last ``duration_s``, or None while fewer seconds have been seen."""
         imu = window.imu
+        if not len(imu):
+            self._stamps_ns, self._values = self._stamps_ns[:0], self._values[:0]
+            return None
         values = np.concatenate([imu.gyro, imu.accel], axis=1)
         follows = len(self._stamps_ns) > 0 and self._stamps_ns[-1] == imu.stamps_ns[0]
         # What happened inside a hole is unknown, so a standstill cannot reach across it.

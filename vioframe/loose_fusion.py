@@ -164,10 +164,14 @@ class LooseFuser(Fuser):
         if window.previous.stamp_ns != self._stamp_ns:
             self._coast_to(window)
         delta = measurement.inertial_delta
-        if delta is None:
+        if not len(window.imu):
+            self._count("windows without inertial samples")
+            delta = self._coasting(seconds(window.current.stamp_ns - window.previous.stamp_ns))
+        elif delta is None:
             raise StateError(f"{type(self).__name__}.update needs an inertial increment: set integrator=preintegration")
-        delta = self._inertial.scaled(delta, self._adapted)
-        if window.gap_ns > self._gap_allowed_ns:
+        else:
+            delta = self._inertial.scaled(delta, self._adapted)
+        if len(window.imu) and window.gap_ns > self._gap_allowed_ns:
             self._count("inertial gaps")
             delta = add_gap(
                 delta, seconds(window.gap_ns), self._inertial.gap_rate_sigma, self._inertial.gap_accel_sigma
@@ -185,12 +189,15 @@ class LooseFuser(Fuser):
     def _coast_to(self, window: SyncedWindow) -> None:
         """Cross a stretch for which no window came."""
         self._count("missing windows")
-        duration = seconds(window.previous.stamp_ns - self._stamp_ns)
-        options = self._inertial
-        delta = coasting(
-            self._filter.body, duration, self._filter.gravity, options.gap_rate_sigma, options.gap_accel_sigma
-        )
+        delta = self._coasting(seconds(window.previous.stamp_ns - self._stamp_ns))
         self._advance(Step(delta=delta, motion=None, at_rest=False, current_ns=window.previous.stamp_ns))
+
+    def _coasting(self, duration_s: float) -> InertialDelta:
+        """The increment of a stretch without samples."""
+        options = self._inertial
+        return coasting(
+            self._filter.body, duration_s, self._filter.gravity, options.gap_rate_sigma, options.gap_accel_sigma
+        )
 
     def _stand_still(self) -> bool:
         """Measure no motion since the clone; False if the measurement does not fit."""

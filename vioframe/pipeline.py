@@ -61,7 +61,8 @@ class Pipeline:
     """A synchronizer and a fuser, with a front end, a VO and an integrator where they are wanted.
 
     Inside a window: integrate (with ``fuser.bias()``), predict the rotation, process the image, estimate
-    the motion, fuse.
+    the motion, fuse. A window without inertial samples has no increment; one of whose two images never came
+    has no features and an invalid motion.
 
     Args:
         choices: what the user called each part, for messages, such as ``{"fuser": "ekf"}``.
@@ -186,7 +187,7 @@ class Pipeline:
         return states
 
     def _integrate(self, window: SyncedWindow) -> InertialDelta | None:
-        if self.integrator is None:
+        if self.integrator is None or not len(window.imu):
             return None
         started = time.perf_counter()
         delta = self.integrator.integrate(window.imu, self.fuser.bias())
@@ -194,23 +195,27 @@ class Pipeline:
         return delta
 
     def _see(self, window: SyncedWindow, delta: InertialDelta | None) -> VisualFeatures | None:
+        if window.current.missing or (self.frontend is None and self.vo is None):
+            return None
+        known = self._features is not None and self._features.frame.stamp_ns == window.previous.stamp_ns
         if self.frontend is None:
             # A VO that reads pixels itself still gets both frames.
-            if self.vo is None:
-                return None
-            if self._features is None or self._features.frame.stamp_ns != window.previous.stamp_ns:
-                self._features = VisualFeatures(frame=window.previous)
+            if not known:
+                self._features = None if window.previous.missing else VisualFeatures(frame=window.previous)
             return VisualFeatures(frame=window.current)
         started = time.perf_counter()
-        if self._features is None or self._features.frame.stamp_ns != window.previous.stamp_ns:
-            self._features = self.frontend.process(window.previous, None)
+        if not known:
+            self._features = None if window.previous.missing else self.frontend.process(window.previous, None)
         features = self.frontend.process(window.current, None if delta is None else delta.delta_R)
         self.timers["frontend"].add(started)
         return features
 
     def _estimate(self, features: VisualFeatures | None) -> RelativePose | None:
-        if self.vo is None or features is None or self._features is None:
+        if self.vo is None:
             return None
+        if features is None or self._features is None:
+            # One of the two images never came.
+            return RelativePose.invalid()
         started = time.perf_counter()
         relative_pose = self.vo.estimate(self._features, features)
         self.timers["vo"].add(started)

@@ -24,10 +24,12 @@ class Frame:
     Attributes:
         stamp_ns: camera clock until a synchronizer has seen it, IMU clock after.
         images: one (H, W) or (H, W, 3) uint8 RGB array per camera; empty where only stamps are known.
+        missing: a synchronizer's stand-in for an image that did not come: there is a stamp, and nothing was seen.
     """
 
     stamp_ns: int
     images: tuple[Image, ...] = ()
+    missing: bool = False
 
     def __post_init__(self) -> None:
         for index, image in enumerate(self.images):
@@ -182,7 +184,8 @@ class SyncedWindow:
 
     Attributes:
         previous, current: frames on the IMU clock.
-        imu: with samples exactly at both stamps; empty where the rig has no inertial sensor.
+        imu: with samples exactly at both stamps; empty where there are none: the rig has no inertial sensor, or it
+            fell silent and the synchronizer gives windows all the same.
         gap_ns: longest time without a measured sample inside the window.
         camera_delay_ns: what was added to the camera's stamp of ``current`` to bring it onto the IMU clock.
     """

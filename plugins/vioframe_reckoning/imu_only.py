@@ -100,7 +100,7 @@ class ImuOnlyFuser(Fuser):
         if self._filter is None:
             raise StateError("ImuOnlyFuser.update was called before setup(rig): set the fuser up first")
         window, delta = measurement.window, measurement.inertial_delta
-        if delta is None:
+        if delta is None and len(window.imu):
             raise StateError("fuser=imu_only needs an inertial increment: set integrator=preintegration")
         states = []
         if self._stamp_ns is None:
@@ -114,7 +114,12 @@ class ImuOnlyFuser(Fuser):
         if self._stamp_ns is not None and self._stamp_ns != window.previous.stamp_ns:
             self._counts["missing windows"] += 1
             self._filter.propagate(self._unseen(self._filter, seconds(window.previous.stamp_ns - self._stamp_ns)))
-        self._move(self._filter, measurement, delta)
+        if delta is None:
+            self._counts["windows without inertial samples"] += 1
+            duration = seconds(window.current.stamp_ns - window.previous.stamp_ns)
+            self._filter.propagate(self._unseen(self._filter, duration))
+        else:
+            self._move(self._filter, measurement, delta)
         self._stamp_ns = window.current.stamp_ns
         states.append(self._filter.nav_state(self._stamp_ns, "tracking"))
         return states

@@ -20,7 +20,7 @@ from vioframe.interfaces import (
 )
 from vioframe.pipeline import Pipeline
 from vioframe.testing import make_scene
-from vioframe.types import NavState, RelativePose, SensorRig, SyncedWindow, VisualFeatures
+from vioframe.types import ImuBlock, NavState, RelativePose, SensorRig, SyncedWindow, VisualFeatures
 
 SCENE = make_scene()
 
@@ -156,6 +156,52 @@ def test_recording_without_inertial_samples_is_refused_by_who_integrates():
     with pytest.raises(WiringError, match=r"integrator=paper needs inertial samples.*integrator=none"):
         pipeline.setup(bare)
     Pipeline(synchronizer=Replay(), vo=Steps(), fuser=Keep()).setup(bare)
+
+
+class Holed(Replay):
+    """The scene's windows, of which some images and some samples never came."""
+
+    unseen = (3, 4, 9)
+    silent = (5, 6)
+
+    def setup(self, rig):
+        frames = [replace(f, images=(), missing=True) if k in self.unseen else f for k, f in enumerate(SCENE.frames)]
+        self.windows = {
+            frames[k + 1].stamp_ns: replace(
+                window,
+                previous=frames[k],
+                current=frames[k + 1],
+                imu=ImuBlock.none() if k in self.silent else window.imu,
+            )
+            for k, window in enumerate(SCENE.windows)
+        }
+
+
+class Sums(InertialIntegrator):
+    def setup(self, rig):
+        self.integrated = []
+
+    def integrate(self, imu, bias):
+        self.integrated.append(int(imu.stamps_ns[0]))
+
+
+@pytest.mark.parametrize("frontend", [None, Sight])
+def test_images_and_samples_that_never_came_are_not_asked_for(frontend):
+    sight, sums, fuser = frontend and frontend(), Sums(), Keep()
+    pipeline = Pipeline(synchronizer=Holed(), frontend=sight, vo=Steps(), integrator=sums, fuser=fuser)
+    pipeline.setup(SCENE.rig)
+    list(pipeline.run(SCENE.packets()))
+    count = len(SCENE.windows)
+    assert len(fuser.measurements) == count
+    blind = {k for k in range(count) if {k, k + 1} & set(Holed.unseen)}
+    for k, measurement in enumerate(fuser.measurements):
+        assert measurement.relative_pose.valid == (k not in blind)
+        assert (measurement.features is None) == (k + 1 in Holed.unseen)
+    silent = {SCENE.frames[k].stamp_ns for k in Holed.silent}
+    assert not silent & set(sums.integrated) and len(sums.integrated) == count - len(silent)
+    if sight is not None:
+        seen = [frame.stamp_ns for k, frame in enumerate(SCENE.frames) if k not in Holed.unseen]
+        assert [stamp for stamp, _ in sight.seen] == seen
 
 
 def test_calls_out_of_order_are_refused():

@@ -141,6 +141,10 @@ class TightFuser(Fuser):
         if not self._ready:
             raise StateError(f"{type(self).__name__}.update was called before setup(rig): set the fuser up first")
         window = measurement.window
+        if not len(window.imu) and measurement.inertial_delta is None:
+            # As if no window had come: the next one with samples finds a hole before it, and crosses it.
+            self._count("windows without inertial samples")
+            return []
         if self._stamp_ns is not None and self._stamp_ns != window.previous.stamp_ns:
             self._cross_hole(window)
         self._scatter.push(window)
