@@ -1,0 +1,1 @@
+"""What works on tensors; only imported once torch is known to be there."""
