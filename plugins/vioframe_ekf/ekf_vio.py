@@ -142,7 +142,8 @@ class EkfVioFuser(RelativePoseFuser):
         self._trust = inertial or ImuTrust()
         super().__init__(visual=visual, inertial=self._trust.options(), standstill=standstill, start=start)
         self._learning = learning or LearningOptions()
-        self._holder = NetHolder(self, "fuser", "ekf_vio", self._make, weights, "cpu")
+        self._untrained = weights is None
+        self._holder = NetHolder(self, "fuser", "ekf_vio", self._make, weights, "cpu", works_untrained=True)
 
     @property
     def learns_from(self) -> str:
@@ -161,8 +162,8 @@ class EkfVioFuser(RelativePoseFuser):
 
     @property
     def needs_training(self) -> bool:
-        """It was given no weights: it believes each sensor as far as the options say."""
-        return self._holder.needs_training
+        """It was given no weights: it works, but believes each sensor only as far as the options say."""
+        return self._untrained
 
     @property
     def architecture(self) -> Mapping[str, str | int | float | bool]:

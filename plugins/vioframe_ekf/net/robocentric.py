@@ -194,7 +194,7 @@ def motion_noise(T_prev_cur: Tensor, T_body_cam: Tensor, covariance: Tensor) -> 
     R_body_cam, p_body_cam = T_body_cam[..., :3, :3], T_body_cam[..., :3, 3]
     R = moved[..., :3, :3] @ R_body_cam
     # Ad(T_body_cam), the translation then turned into the reference, where the residual is.
-    top = torch.cat([R_body_cam, torch.zeros_like(R_body_cam)], dim=-1)
+    top = torch.cat([R_body_cam, torch.zeros_like(R_body_cam)], dim=-1).expand(*R.shape[:-1], 6)
     lever = moved[..., :3, :3] @ hat(p_body_cam) @ R_body_cam
     into = torch.cat([top, torch.cat([lever, R], dim=-1)], dim=-2)
     return moved, into @ covariance @ into.transpose(-1, -2)
