@@ -3,7 +3,6 @@
 The page stands alone: figures are inside it, and it fetches nothing.
 """
 
-import base64
 import json
 import logging
 from collections.abc import Mapping, Sequence
@@ -11,6 +10,7 @@ from html import escape
 from pathlib import Path
 
 from vioframe.evaluation.attempts import attempts_section, start_text
+from vioframe.evaluation.page import image_tag, render_page
 from vioframe.evaluation.protocol import EvaluationOptions, describe_association
 from vioframe.evaluation.rows import Row, metrics_document
 from vioframe.evaluation.run import SequenceRun
@@ -137,7 +137,7 @@ def make_report(
         body.append(_sequence_section(row, paths, anchor=f"s{number}", heading=len(rows) > 1))
     body.append(_protocol_section(options))
     body.append(f"<h2>Configuration</h2><details><summary>resolved</summary><pre>{escape(config_yaml)}</pre></details>")
-    return _PAGE.format(title=escape(title), style=_STYLE, body="\n".join(part for part in body if part))
+    return render_page(title, body)
 
 
 def _parts_line(extra: Mapping[str, object] | None) -> str:
@@ -226,9 +226,7 @@ def _sequence_section(row: Row, figures: Mapping[str, Path], *, anchor: str, hea
 
 
 def _image(title: str, path: Path) -> str:
-    data = base64.b64encode(path.read_bytes()).decode("ascii")
-    width = _WIDTHS.get(title, "full")
-    return f"<img class={width} alt='{escape(title, quote=True)}' src='data:image/png;base64,{data}'>"
+    return image_tag(title, path, width=_WIDTHS.get(title, "full"))
 
 
 def _accuracy_table(row: Row) -> str:
@@ -284,47 +282,3 @@ def _protocol_section(options: EvaluationOptions) -> str:
     )
     paragraphs = "".join(f"<p>{escape(fact)}</p>" for fact in facts)
     return f"<h2>Protocol</h2>{paragraphs}<details><summary>definitions</summary><table>{terms}</table></details>"
-
-
-_STYLE = """
-:root { color-scheme: light; }
-body { font: 15px/1.5 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; color: #262626; background: #fff;
-       max-width: 1180px; margin: 2rem auto; padding: 0 1.2rem; }
-h1 { font-size: 1.7rem; margin: 0 0 .2rem; }
-h2 { font-size: 1.25rem; margin: 2.4rem 0 .6rem; border-bottom: 1px solid #ddd; padding-bottom: .25rem; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .92rem; margin: .5rem 0; }
-th { font-weight: 600; text-align: right; vertical-align: bottom; padding: .25rem .6rem; }
-thead th { border-bottom: 1.5px solid #888; }
-th small { font-weight: 400; color: #777; }
-td { text-align: right; padding: .16rem .6rem; border-bottom: 1px solid #eee; }
-td.name, th.name, td.text { text-align: left; }
-td.unit { text-align: left; color: #777; padding-left: 0; }
-tr.final td { color: #a85a12; }
-tr.final td.name { padding-left: 1.6rem; }
-td.failed, td.interrupted { color: #b3202c; font-weight: 600; }
-.undefined { color: #999; font-style: italic; font-size: .8rem; }
-.columns { display: flex; flex-wrap: wrap; gap: .5rem 3.5rem; align-items: flex-start; }
-.scroll { overflow-x: auto; }
-.scroll td, .scroll th { padding-left: .4rem; padding-right: .4rem; }
-.parts { color: #555; margin: 0 0 1rem; }
-.failure { background: #fdecec; border-left: 4px solid #b3202c; padding: .5rem .8rem; }
-.counters { background: #fff6e0; border-left: 4px solid #d9a441; padding: .4rem .8rem; }
-h3 { font-size: 1.05rem; margin: 1.6rem 0 .3rem; }
-li.bad { color: #b3202c; font-weight: 600; }
-details ul { margin: .2rem 0; padding-left: 1.1rem; }
-.note { color: #777; font-size: .86rem; margin: .3rem 0; }
-img { width: 100%; display: block; margin: 1.2rem 0; }
-img.large { width: 76%; margin: 1rem auto; }
-img.half { width: 49.4%; display: inline-block; margin: .4rem 0; }
-pre { background: #f6f6f6; padding: .8rem; overflow-x: auto; font-size: .84rem; }
-summary { cursor: pointer; color: #1f6fb4; }
-"""
-_PAGE = """<!doctype html>
-<html lang="en">
-<head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title><style>{style}</style></head>
-<body>
-{body}
-</body>
-</html>
-"""

@@ -105,7 +105,7 @@ def draw_panel(axes: "Axes", column: Column, curves: Curves) -> None:
     numbers = sorted({number for line in curves.lines.values() for number in line})
     drawn: list[float] = []
     for place, (label, line) in enumerate(curves.lines.items()):
-        colour, marker = _COLOURS[place], _MARKERS[place]
+        colour, marker = _COLOURS[place % len(_COLOURS)], _MARKERS[place % len(_MARKERS)]
         known = {number: sorted(_values(jobs, column)) for number, jobs in line.items() if _is_known(jobs, column)}
         drawn += [value for each in known.values() for value in each]
         x = list(known)

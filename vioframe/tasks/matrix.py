@@ -13,16 +13,16 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
+from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from vioframe.build import OPTIONAL_SLOTS, build, build_pipeline
+from vioframe.composing import Composer
 from vioframe.data.recording import Dataset, Recording
 from vioframe.errors import VioframeError
 from vioframe.pipeline import SLOTS
-from vioframe.plugins import core_conf, discover, extend_hydra
+from vioframe.plugins import core_conf, discover
 from vioframe.tasks.progress import frame_progress
 from vioframe.tasks.run_sequence import initial_state, lend_ground_truth
 from vioframe.types import Frame, Packet
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 Outcome = Literal["ran", "refused", "crashed"]
 
 # Groups of plugins whose options are no parts of a pipeline, or choose several.
-_NO_PARTS = {"dataset", "viewer", "system", "experiment", "trainer", "training_data"}
+_NO_PARTS = {"dataset", "viewer", "system", "experiment", "study", "trainer", "training_data"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +63,7 @@ def run(config: DictConfig) -> int:
     duration_s = float(config.task.duration_s)
     combinations = list(enumerate_choices())
     results: list[Combination] = []
-    with frame_progress("combinations", len(combinations) + 1, shown=bool(config.progress)) as advance, _composer():
+    with frame_progress("combinations", len(combinations) + 1, shown=bool(config.progress)) as advance, Composer():
         recording, packets = _record(duration_s)
         for done, choices in enumerate(combinations, start=1):
             results.append(try_combination(choices, recording, packets))
@@ -114,21 +114,6 @@ def _offered(group: str) -> list[str]:
     """Options of a group: the core's first, then those of each plugin."""
     folders = [core_conf(), *(found.conf for found in discover() if found.conf is not None)]
     return [name for conf in folders for name in sorted(path.stem for path in (conf / group).glob("*.yaml"))]
-
-
-class _composer:
-    """Hydra's compose API inside a running job: the application's own state is put back afterwards."""
-
-    def __enter__(self) -> None:
-        self._before = GlobalHydra.instance().hydra
-        GlobalHydra.instance().clear()
-        extend_hydra()
-        self._inner = initialize_config_dir(str(core_conf()), version_base="1.3")
-        self._inner.__enter__()
-
-    def __exit__(self, *exc: object) -> None:
-        self._inner.__exit__(None, None, None)
-        GlobalHydra.instance().hydra = self._before
 
 
 def _record(duration_s: float) -> tuple[Recording, list[Packet]]:

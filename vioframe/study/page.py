@@ -1,0 +1,114 @@
+"""The page of a study, and its numbers as CSV and JSON."""
+
+import csv
+import json
+from collections.abc import Iterator
+from dataclasses import asdict
+from html import escape
+from pathlib import Path
+
+from vioframe import __version__
+from vioframe.evaluation.page import image_tag, render_page
+from vioframe.study.figure import draw_study
+from vioframe.study.summary import StudySummary
+from vioframe.sweep.summary import Column
+
+
+def write_study(summary: StudySummary, folder: Path, config_yaml: str) -> list[Path]:
+    """Write ``study.png``, ``study.html``, ``study.csv`` and ``study.json``; return their paths.
+
+    Args:
+        summary: of what was run.
+        folder: made where it is missing.
+        config_yaml: the resolved configuration of the study.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    figure, page, table, document = (folder / f"study.{kind}" for kind in ("png", "html", "csv", "json"))
+    draw_study(summary, figure)
+    page.write_text(make_page(summary, figure, config_yaml), encoding="utf-8")
+    _write_csv(summary, table)
+    entries = [{**asdict(cell), **asdict(result)} for cell, result in summary.results.items()]
+    content = {
+        "study": summary.study.name,
+        "key": summary.study.key,
+        "vioframe": __version__,
+        "variants": {name: summary.study.variants[name] for name in summary.study.chosen},
+        "sentences": summary.sentences(),
+        "cells": entries,
+    }
+    document.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    return [figure, page, table, document]
+
+
+def make_page(summary: StudySummary, figure: Path, config_yaml: str) -> str:
+    """The page as HTML; the figure is inside it."""
+    study = summary.study
+    seeds = ", ".join(map(str, study.seeds))
+    body = [
+        f"<h1>{escape(study.title)}</h1>",
+        f"<p class=parts><code>{escape(study.key)}</code> · seeds {seeds} · {len(summary.results)} runs · "
+        f"vioframe {escape(__version__)}</p>",
+    ]
+    for error, cells in summary.failures().items():
+        told = ", ".join(str(cell) for cell in cells)
+        body.append(f"<p class=failure><b>{len(cells)} failed</b> ({escape(told)}): {escape(error)}</p>")
+    body.append(image_tag(study.title, figure))
+    body.append("<ul>" + "".join(f"<li>{escape(sentence)}</li>" for sentence in summary.sentences()) + "</ul>")
+    for column in summary.columns:
+        body += _section(summary, column)
+    variants = "".join(
+        f"<tr><td class=name>{escape(name)}</td><td class=text><code>{escape(' '.join(study.variants[name]))}</code>"
+        "</td></tr>"
+        for name in study.chosen
+    )
+    common = escape(" ".join(study.base))
+    body.append(f"<h2>Variants</h2><p>All: <code>{common}</code></p><table>{variants}</table>")
+    body.append(f"<h2>Configuration</h2><details><summary>resolved</summary><pre>{escape(config_yaml)}</pre></details>")
+    return render_page(f"vioframe: {study.title}", body)
+
+
+def _section(summary: StudySummary, column: Column) -> Iterator[str]:
+    study = summary.study
+    yield f"<h2>{escape(column.title)}</h2>"
+    heads = "".join(f"<th>{study.shown(value)}</th>" for value in study.all_values())
+    rows = []
+    for variant in study.chosen:
+        cells = "".join(_cell(summary, variant, value, column) for value in study.all_values())
+        rows.append(f"<tr><td class=name>{escape(variant)}</td>{cells}</tr>")
+    yield (
+        f"<div class=scroll><table><thead><tr><th class=name>{escape(study.axis)}</th>{heads}</tr></thead>"
+        f"<tbody>{''.join(rows)}</tbody></table></div>"
+    )
+    percent = f"{100.0 * study.tolerance:g} %"
+    yield f"<p class=note>Median over seeds, range below; change against {study.shown(study.reference)}, "
+    yield f"bold where more than {percent} is lost.</p>"
+
+
+def _cell(summary: StudySummary, variant: str, value: float, column: Column) -> str:
+    spread = summary.spread(variant, value, column)
+    if spread is None:
+        reasons = {
+            result.undefined.get(column.key, result.error)
+            for cell, result in summary.results.items()
+            if (cell.variant, cell.value) == (variant, value)
+        }
+        told = "; ".join(sorted(reason for reason in reasons if reason))
+        return f"<td><span class=undefined title='{escape(told, quote=True)}'>undefined</span></td>"
+    text = f"{spread.median:.{column.decimals}f}"
+    if spread.high > spread.low:
+        text += f"<br><small>{spread.low:.{column.decimals}f}…{spread.high:.{column.decimals}f}</small>"
+    loss = summary.loss(variant, value, column)
+    if loss is not None and value != summary.study.reference:
+        change = f"{loss:+.0%}"
+        text += f"<br><small>{f'<b>{change}</b>' if loss > summary.study.tolerance else change}</small>"
+    return f"<td>{text}</td>"
+
+
+def _write_csv(summary: StudySummary, path: Path) -> None:
+    names = sorted({name for result in summary.results.values() for name in result.metrics})
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["variant", summary.study.key, "seed", "status", "error", *names])
+        for cell, result in summary.results.items():
+            numbers = (repr(result.metrics[name]) if name in result.metrics else "" for name in names)
+            writer.writerow([cell.variant, cell.value, cell.seed, result.status, result.error, *numbers])
