@@ -56,6 +56,7 @@ def options(folder, **changes) -> TrainerOptions:
         "precision": "32",
         "workers": 0,
         "resume": None,
+        "fusion": {},
     }
     return TrainerOptions(**{**plain, **changes}, augmentation=augmentation)
 

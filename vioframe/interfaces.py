@@ -216,6 +216,11 @@ class Trainable(Protocol):
             ``{"part": "tsvo", "backbone": "resnet50", "stack": 10}``.
         needs_training: its answers mean nothing yet: it was given no weights, and does not work without any. An
             experiment trains such a part first.
+
+    Two more it may have. ``learns_from``: ``"images"``, as all parts without it, or ``"answers"``: it is trained by
+    itself, after the others, on windows without images that bring what the parts before it answered; it finds their
+    ``"T_prev_cur"``, ``"covariance"`` (zero where none was stated) and ``"valid"`` upstream. ``training_pairs``: the
+    pairs of images that its windows should have where ``trainer.pairs`` does not say; else ``context_pairs``.
     """
 
     @property

@@ -132,6 +132,6 @@ def test_flow_is_drawn_for_images_of_any_shape(tmp_path, shape, channels):
 def test_a_curve_may_have_any_values(tmp_path, losses):
     rows = [{"epoch": float(i), "train/loss": loss, "learning_rate": 1e-3} for i, loss in enumerate(losses)]
     rows[0] |= {"validation/loss": 1.0, "validation/t_rel_percent": 20.0, "validation/r_rel_deg_per_100m": 5.0}
-    rows[0]["validation/relative_to_constant_motion"] = 0.6
-    draw_curve(tmp_path / "curve.png", rows, CONSTANT)
+    rows[0]["validation/relative_to_reference"] = 0.6
+    draw_curve(tmp_path / "curve.png", rows, CONSTANT, "constant motion")
     assert size_of_png(tmp_path / "curve.png")[0] > 800

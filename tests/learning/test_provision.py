@@ -13,7 +13,8 @@ from vioframe.build import build, build_pipeline
 from vioframe.data.recording import Dataset
 from vioframe.errors import ConfigError
 from vioframe.learning.training import train_parts
-from vioframe.tasks.provision import _bearing, provide_weights, untrained_slots
+from vioframe.tasks.bearing import bearing
+from vioframe.tasks.provision import provide_weights, untrained_slots
 from vioframe.tracking import NullTracker
 
 SMALL = [
@@ -112,7 +113,7 @@ def test_weights_to_start_from_count_by_their_content(tmp_path):
     keys = []
     for content in (b"one", b"two", b"one"):
         file.write_bytes(content)
-        keys.append(_bearing({"weights": None, "backbone": {"weights": str(file)}, "device": "cpu"}))
+        keys.append(bearing({"weights": None, "backbone": {"weights": str(file)}, "device": "cpu"}))
     assert keys[0] == keys[2] != keys[1]
     assert "device" not in keys[0]
 

@@ -56,7 +56,7 @@ def test_one_batch_is_overfitted(tmp_path):
     untrained = run(tmp_path / "before", TinyVo(dropout=0.0), max_epochs=1, epoch_windows=12, batch_size=12)
     trained = run(tmp_path, TinyVo(dropout=0.0), max_epochs=10, **changes)
     assert trained.curve[-1]["train/loss"] < 0.01 * untrained.curve[0]["train/loss"]
-    assert trained.score.t_rel_percent < 0.2 * trained.constant.t_rel_percent
+    assert trained.score.t_rel_percent < 0.2 * trained.reference.t_rel_percent
 
 
 def test_the_same_seed_gives_the_same_curve_with_and_without_workers(tmp_path):
@@ -118,14 +118,14 @@ def test_best_weights_are_kept_loaded_and_described(tmp_path):
     trained = run(tmp_path, part, max_epochs=4, top_k=2)
     files = sorted((tmp_path / "weights").glob("*.safetensors"))
     assert len(files) == 2
-    ranks = {row["epoch"]: row["validation/relative_to_constant_motion"] for row in trained.curve}
+    ranks = {row["epoch"]: row["validation/relative_to_reference"] for row in trained.curve}
     kept = {int(path.stem[-4:]) for path in files}
     assert kept == set(sorted(ranks, key=ranks.get)[:2])
     card = json.loads(trained.weights["vo"].with_suffix(".json").read_text())
     assert card["architecture"] == dict(part.architecture)
     assert card["data"]["training"] == [{"name": "scene", "images": len(stored()), "sha256": "a"}]
     assert card["validation"]["t_rel_percent"] == trained.score.t_rel_percent
-    assert {"split_sha256", "code", "licence", "trainer", "constant_motion"} <= set(card)
+    assert {"split_sha256", "code", "licence", "trainer", "reference"} <= set(card)
     assert card["validation"]["protocol"]
     twin = TinyVo()
     load_weights(trained.weights["vo"], twin, "vo.weights")

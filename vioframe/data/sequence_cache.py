@@ -1,7 +1,8 @@
 """Recordings decoded once for training: images on disk as plain arrays, mapped into memory when they are read.
 
 One shard is one recording, in a folder of its own: ``images.u8`` ((F, H, W, C) bytes, resized, then without loss),
-``arrays.npz`` (stamps, poses, inertial samples, calibration) and ``manifest.json``, written last. The folder's
+``arrays.npz`` (stamps, poses, inertial samples, calibration) and ``manifest.json``, written last. What learns from the
+answers of a VO needs no images: they may be left out. The folder's
 name is a hash of what went in: the configuration of the data set, calibration, truth, the first frames' pixels, the
 size asked for and the version of this package. The manifest holds a hash of all that came out, which a trained net's
 card cites.
@@ -29,7 +30,7 @@ from vioframe.data.recording import CORRUPT_IMAGES, Recording
 from vioframe.data.windows import StoredSequence
 from vioframe.errors import ConfigError, DataError, VioframeError
 from vioframe.geometry.interpolation import differentiate_positions, interpolate_poses
-from vioframe.types import Camera, Frame, Image, ImuBlock, Trajectory
+from vioframe.types import Camera, Frame, Image, ImuBlock, Packet, Trajectory
 
 log = logging.getLogger(__name__)
 
@@ -51,12 +52,13 @@ class SequenceCache:
         folder: created when first needed.
         size_px: (width, height) of the stored images.
         channels: 1 (grey) or 3 (RGB).
+        images: False leaves them out, and takes recordings that have none.
 
     Raises:
         ConfigError: a size that is not positive, or another number of channels.
     """
 
-    def __init__(self, folder: Path, *, size_px: tuple[int, int], channels: int) -> None:
+    def __init__(self, folder: Path, *, size_px: tuple[int, int], channels: int, images: bool = True) -> None:
         if len(size_px) != 2 or min(size_px) < 8:
             raise ConfigError(f"trainer.size_px must be [width, height] of 8 px or more, got {list(size_px)}")
         if channels not in (1, 3):
@@ -64,6 +66,7 @@ class SequenceCache:
         self._folder = folder
         self._size_px = (int(size_px[0]), int(size_px[1]))
         self._channels = channels
+        self._images = images
 
     def get(
         self, recording: Recording, source: str, progress: Callable[[int], None] = lambda done: None
@@ -71,26 +74,39 @@ class SequenceCache:
         """What :func:`read_stored` makes of :meth:`store`, with the errors of both."""
         return read_stored(self.store(recording, source, progress))
 
-    def store(self, recording: Recording, source: str, progress: Callable[[int], None] = lambda done: None) -> Path:
+    def store(
+        self,
+        recording: Recording,
+        source: str,
+        progress: Callable[[int], None] = lambda done: None,
+        watch: Callable[[Packet], None] = lambda packet: None,
+    ) -> Path:
         """The folder of the stored recording, which is decoded now if it was not before.
 
         Args:
             recording: opened.
             source: what it was opened from: the resolved configuration of its data set, as text, less what names it.
             progress: told how many frames are done.
+            watch: shown every packet, if it is decoded now.
 
         Raises:
             DataError: no images, no truth, images that cannot be stored, no space on the disk.
         """
+        target = self.place(recording, source)
+        if not (target / "manifest.json").exists():
+            self._write(recording, target, progress, watch)
+        return target
+
+    def place(self, recording: Recording, source: str) -> Path:
+        """Where :meth:`store` keeps a recording; errors as of there."""
         truth = recording.ground_truth()
         if truth is None or len(truth) < 2:
             raise DataError(f"{recording.name} has no ground truth, so nothing can be learned from it: leave it out")
-        if not recording.rig.cameras or not recording.rig.has_images:
+        if not recording.rig.cameras:
+            raise DataError(f"{recording.name} has no camera whose motion could be learned: leave it out")
+        if self._images and not recording.rig.has_images:
             raise DataError(f"{recording.name} has no images to learn from: choose rig=mono, or leave it out")
-        target = self._folder / f"{_clean(recording.name)}-{self._key(recording, source)[:16]}"
-        if not (target / "manifest.json").exists():
-            self._write(recording, target, progress)
-        return target
+        return self._folder / f"{_clean(recording.name)}-{self._key(recording, source)[:16]}"
 
     def _key(self, recording: Recording, source: str) -> str:
         truth = recording.ground_truth()
@@ -104,6 +120,7 @@ class SequenceCache:
             recording.name,
             self._size_px,
             self._channels,
+            self._images,
             recording.frame_count,
         ]
         words += [camera.model, camera.size_px, rig.gravity, rig.camera_delay_ns, recording.faults()]
@@ -117,12 +134,15 @@ class SequenceCache:
             if number == _FRAMES_IN_KEY:
                 break
             digest.update(frame.stamp_ns.to_bytes(8, "little", signed=True))
-            digest.update(np.ascontiguousarray(frame.images[0]).tobytes())
+            for image in frame.images[:1]:
+                digest.update(np.ascontiguousarray(image).tobytes())
         return digest.hexdigest()
 
-    def _write(self, recording: Recording, target: Path, progress: Callable[[int], None]) -> None:
+    def _write(
+        self, recording: Recording, target: Path, progress: Callable[[int], None], watch: Callable[[Packet], None]
+    ) -> None:
         width, height = self._size_px
-        needed = recording.frame_count * width * height * self._channels
+        needed = recording.frame_count * width * height * self._channels * self._images
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             free = shutil.disk_usage(self._folder).free
@@ -133,7 +153,7 @@ class SequenceCache:
         except OSError as error:
             raise DataError(f"trainer.cache={self._folder} cannot be written to: {error.strerror}") from error
         try:
-            self._fill(recording, partial, progress)
+            self._fill(recording, partial, progress, watch)
             os.replace(partial, target)
         except OSError as error:
             if (target / "manifest.json").exists():
@@ -145,15 +165,23 @@ class SequenceCache:
         finally:
             shutil.rmtree(partial, ignore_errors=True)
 
-    def _fill(self, recording: Recording, folder: Path, progress: Callable[[int], None]) -> None:
+    def _fill(
+        self, recording: Recording, folder: Path, progress: Callable[[int], None], watch: Callable[[Packet], None]
+    ) -> None:
         digest = hashlib.sha256()
         stamps: list[int] = []
         blocks: list[ImuBlock] = []
         size: tuple[int, ...] | None = None
         with (folder / "images.u8").open("wb") as file:
             for packet in recording.packets():
+                watch(packet)
                 if isinstance(packet, ImuBlock):
                     blocks.append(packet)
+                    continue
+                stamp_ns = packet.stamp_ns + recording.rig.camera_delay_ns
+                if not self._images:
+                    stamps.append(stamp_ns)
+                    progress(len(stamps))
                     continue
                 if not packet.images:
                     continue
@@ -167,7 +195,7 @@ class SequenceCache:
                 pixels = self._convert(image).tobytes()
                 file.write(pixels)
                 digest.update(pixels)
-                stamps.append(packet.stamp_ns + recording.rig.camera_delay_ns)
+                stamps.append(stamp_ns)
                 progress(len(stamps))
         _check_losses(recording, len(stamps))
         if len(stamps) < 2:
@@ -184,7 +212,7 @@ class SequenceCache:
             "format": _FORMAT,
             "name": recording.name,
             "model": recording.rig.cameras[0].model,
-            "size_px": list(self._size_px),
+            "size_px": list(self._size_px) if self._images else [0, 0],
             "channels": self._channels,
             "images": len(stamps),
             "sha256": digest.hexdigest(),
@@ -207,7 +235,9 @@ class SequenceCache:
         if truth is None:
             raise DataError(f"{recording.name} has no ground truth")
         poses, known = interpolate_poses(truth, stamps, max_gap_ns=_MAX_TRUTH_GAP_NS)
-        camera = resized_camera(recording.rig.cameras[0], self._size_px)
+        camera = recording.rig.cameras[0]
+        if self._images:
+            camera = resized_camera(camera, self._size_px)
         T_world_cam = poses @ camera.T_body_cam
         T_world_cam[~known] = np.eye(4)
         return {
@@ -219,6 +249,7 @@ class SequenceCache:
             "accel": np.concatenate([np.zeros((0, 3)), *(block.accel for block in blocks)]),
             "intrinsics_px": camera.intrinsics_px,
             "distortion": camera.distortion,
+            "camera_size_px": np.array(camera.size_px),
             "T_body_cam": camera.T_body_cam,
             "gravity": np.array(recording.rig.gravity),
             "truth_stamps_ns": truth.stamps_ns,
@@ -244,8 +275,12 @@ def read_stored(folder: Path) -> tuple[StoredSequence, str]:
     try:
         manifest: dict[str, Any] = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
         width, height = manifest["size_px"]
-        images = np.memmap(
-            folder / "images.u8", np.uint8, "r", shape=(manifest["images"], height, width, manifest["channels"])
+        shape = (manifest["images"], height, width, manifest["channels"])
+        # Nothing cannot be mapped.
+        images = (
+            np.memmap(folder / "images.u8", np.uint8, "r", shape=shape)
+            if width
+            else np.zeros((*shape[:3], 1), dtype=np.uint8)
         )
         with np.load(folder / "arrays.npz", allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
@@ -261,7 +296,7 @@ def read_stored(folder: Path) -> tuple[StoredSequence, str]:
                 model=manifest["model"],
                 intrinsics_px=arrays["intrinsics_px"],
                 distortion=arrays["distortion"],
-                size_px=(width, height),
+                size_px=tuple(arrays["camera_size_px"].tolist()),
                 T_body_cam=arrays["T_body_cam"],
             ),
             gravity=float(arrays["gravity"]),
@@ -288,7 +323,7 @@ def _check_losses(recording: Recording, stored: int) -> None:
 
 def _frames(recording: Recording) -> Iterator[Frame]:
     for packet in recording.packets():
-        if isinstance(packet, Frame) and packet.images:
+        if isinstance(packet, Frame):
             yield packet
 
 

@@ -28,7 +28,7 @@ class TrainingModule(lightning.LightningModule):
         parts: by slot, in the order of the pipeline.
         options: of the training.
         validation: recordings that validation batches are cut from.
-        constant: score of constant motion on them, for the ranking.
+        reference: score of what stands beside the parts, for the ranking: of constant motion, or of the VO alone.
 
     Attributes:
         score: of the last validation, or None.
@@ -43,7 +43,7 @@ class TrainingModule(lightning.LightningModule):
         parts: Mapping[str, Trainable],
         options: TrainerOptions,
         validation: Sequence[StoredSequence],
-        constant: Score,
+        reference: Score,
     ) -> None:
         super().__init__()
         chosen = list(parts) if options.train is None else list(options.train)
@@ -59,7 +59,7 @@ class TrainingModule(lightning.LightningModule):
         self._options = options
         self._chosen = chosen
         self._validation = tuple(validation)
-        self._constant = constant
+        self._reference = reference
         self._predicted: list[Array] = []
         self._answered: list[np.ndarray] = []
         for slot, net in self.nets.items():
@@ -135,8 +135,10 @@ class TrainingModule(lightning.LightningModule):
             )
         first = batch.pairs - motions.shape[1]
         for recording, start, predicted in zip(batch.recording.tolist(), batch.start.tolist(), motions, strict=True):
-            covered = slice(start + first, start + batch.pairs)
-            self._predicted[recording][covered] = predicted
+            covered = np.arange(start + first, start + batch.pairs)
+            # Windows come in order: what an earlier one has answered it has answered with more to look back at.
+            new = ~self._answered[recording][covered]
+            self._predicted[recording][covered[new]] = predicted[new]
             self._answered[recording][covered] = True
         return losses
 
@@ -152,8 +154,8 @@ class TrainingModule(lightning.LightningModule):
 
     @property
     def rank_value(self) -> float:
-        """What checkpoints are ranked by, less is better: the last score relative to constant motion."""
-        return float("inf") if self.score is None else self.score.relative_to(self._constant)
+        """What checkpoints are ranked by, less is better: the last score relative to the reference's."""
+        return float("inf") if self.score is None else self.score.relative_to(self._reference)
 
     def trajectories(self) -> list[tuple[StoredSequence, Array, np.ndarray]]:
         """Each validation recording with its predicted motions and where there are any, of the last validation."""

@@ -1,8 +1,8 @@
 """``trainer=``: how parts are trained; every field is a line of ``conf/trainer/default.yaml``."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Literal
+from typing import Any, Literal
 
 from vioframe.checks import check_not_negative, check_positive
 from vioframe.data.augmentation import Augmentation
@@ -15,7 +15,8 @@ _CHOICES = {
     "precision": ("auto", "32", "bf16", "16"),
 }
 
-_WITHOUT_BEARING = ("cache", "resume", "workers")
+# ``fusion`` has one in the second stage only, whose options it is part of.
+_WITHOUT_BEARING = ("cache", "resume", "workers", "fusion")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +50,7 @@ class TrainerOptions:
         workers: processes that cut and change windows; None: as many as there are cores to spare, at most 16.
         resume: file of a run that was stopped; None begins anew.
         augmentation: of the training windows.
+        fusion: options that are others where a fuser is trained on what a VO answered.
 
     Raises:
         ConfigError: with the key and its value.
@@ -85,6 +87,7 @@ class TrainerOptions:
     workers: int | None
     resume: str | None
     augmentation: Augmentation
+    fusion: Mapping[str, Any]
 
     def __post_init__(self) -> None:
         for name, allowed in _CHOICES.items():

@@ -99,18 +99,19 @@ def draw_flow(path: Path, pair: Array, flow: Array, caption: str) -> None:
         figure.savefig(path)
 
 
-def draw_curve(path: Path, rows: Sequence[Mapping[str, float]], constant: Score) -> None:
+def draw_curve(path: Path, rows: Sequence[Mapping[str, float]], reference: Score, beside: str) -> None:
     """Write a figure of a training's curve: loss, t_rel, r_rel and learning rate over the epochs.
 
     Args:
         path: a PNG file.
         rows: an epoch each, as in ``curve.csv``.
-        constant: score of constant motion on the validation recordings.
+        reference: score to compare with, on the validation recordings.
+        beside: what it is of.
     """
     import matplotlib as mpl
 
-    ranked = [row for row in rows if "validation/relative_to_constant_motion" in row]
-    best = min(ranked, key=lambda row: row["validation/relative_to_constant_motion"], default=None)
+    ranked = [row for row in rows if "validation/relative_to_reference" in row]
+    best = min(ranked, key=lambda row: row["validation/relative_to_reference"], default=None)
     with mpl.rc_context(STYLE):
         figure = new_figure((9.0, 5.6))
         (loss, t_rel), (rate, r_rel) = figure.subplots(2, 2, sharex=True)
@@ -119,11 +120,11 @@ def draw_curve(path: Path, rows: Sequence[Mapping[str, float]], constant: Score)
         loss.set_title("loss")
         loss.legend()
         for axes, name, level, title in (
-            (t_rel, "t_rel_percent", constant.t_rel_percent, "t_rel [%]"),
-            (r_rel, "r_rel_deg_per_100m", constant.r_rel_deg_per_100m, "r_rel [°/100 m]"),
+            (t_rel, "t_rel_percent", reference.t_rel_percent, "t_rel [%]"),
+            (r_rel, "r_rel_deg_per_100m", reference.r_rel_deg_per_100m, "r_rel [°/100 m]"),
         ):
             _draw_series(axes, rows, f"validation/{name}", _VALIDATION, "validation")
-            axes.axhline(level, color=TRUTH, linewidth=1.0, linestyle="--", label="constant motion")
+            axes.axhline(level, color=TRUTH, linewidth=1.0, linestyle="--", label=beside)
             if best is not None:
                 told = f"best weights: {best[f'validation/{name}']:.3g}"
                 axes.plot(best["epoch"], best[f"validation/{name}"], "o", color=FINAL, markersize=5, label=told)

@@ -1,8 +1,8 @@
 """How good predicted motions are on the validation recordings: t_rel and r_rel of the trajectories they make.
 
-Beside them stands what a predictor without eyes reaches on the same segments: the mean motion of the training
-recordings, always. Checkpoints are ranked by both errors relative to it, which weighs metres against degrees by how
-hard each is on the data at hand: ½ (t_rel / t_rel of constant motion + r_rel / r_rel of constant motion).
+Beside them stands a reference on the same segments: what a predictor without eyes reaches, the mean motion of the
+training recordings, always; for a fuser, the VO alone. Checkpoints are ranked by both errors relative to it, which
+weighs metres against degrees by how hard each is on the data at hand: ½ (t_rel / t_rel of it + r_rel / r_rel of it).
 """
 
 import itertools

@@ -80,14 +80,16 @@ class Trained:
     Attributes:
         weights: file of the best weights, by slot; empty if no validation was reached.
         score: of the best, on the validation recordings.
-        constant: of constant motion on the same.
+        reference: of what stands beside it, on the same recordings.
+        beside: what that is: ``constant motion``, or ``the VO alone``.
         epochs: that were completed, those of a resumed run included.
         curve: one row an epoch.
     """
 
     weights: Mapping[str, Path]
     score: Score | None
-    constant: Score
+    reference: Score
+    beside: str
     epochs: int
     curve: Sequence[Row]
 
@@ -120,14 +122,14 @@ def train_parts(
         KeyboardInterrupt: the user stopped it; weights and resume file are those of the last epoch.
     """
     context = max(part.context_pairs for part in parts.values())
-    pairs = options.pairs or context
+    pairs = options.pairs or max(getattr(part, "training_pairs", None) or part.context_pairs for part in parts.values())
     if pairs < context:
         log.warning("trainer.pairs=%d is less than the %d pairs that one answer takes, which are taken", pairs, context)
     train_index = WindowIndex(training.sequences, max(pairs, context), split="training")
     validation_index = _validation_windows(validation.sequences, max(pairs, context))
-    constant = _constant_score(training, validation_index, context, options)
+    beside, reference = _reference(training, validation_index, context, options)
     seed_everything(options.seed)
-    module = TrainingModule(parts, options, validation.sequences, constant)
+    module = TrainingModule(parts, options, validation.sequences, reference)
     data = WindowData(
         train_index,
         validation_index.tiled(validation_index.pairs - context + 1),
@@ -137,7 +139,7 @@ def train_parts(
         seed=options.seed,
         workers=options.workers,
     )
-    base = _card(training, validation, options, about, constant)
+    base = _card(training, validation, options, {**about, "reference": {"what": beside, **asdict(reference)}})
     # A part without weights, such as a classical flow, only takes part.
     trained = {slot: part for slot, part in parts.items() if any(p.requires_grad for p in part.net.parameters())}
     best = BestWeights(folder / "weights", trained, options.top_k, lambda module: {**base, **_figures(module, options)})
@@ -146,30 +148,41 @@ def train_parts(
     watchers: list[Callback] = [Bar()] if shown else []
     watchers += [StopDivergence(options.divergence_factor, options.learning_rate), best]
     watchers += [BestPicture(folder, tracker), FlowPicture(folder, tracker)]
-    watchers += [curve, CurvePicture(curve, constant, folder, tracker), ResumePoint(folder)]
+    watchers += [curve, CurvePicture(curve, reference, beside, folder, tracker), ResumePoint(folder)]
     folder.mkdir(parents=True, exist_ok=True)
     trainer = _trainer(options, folder, watchers)
     _fit(trainer, module, data, options)
-    return _result(best, curve, trained, constant)
+    weights, score = _best(best, trained)
+    return Trained(
+        weights=weights, score=score, reference=reference, beside=beside, epochs=len(curve.rows), curve=curve.rows
+    )
 
 
 def _validation_windows(sequences: Sequence[StoredSequence], pairs: int) -> WindowIndex:
     """Longer than in training, where no run of images is too short for it: what answers share is then found once."""
     index = WindowIndex(sequences, pairs, split="validation")
-    longer = min(pairs + _FURTHER_PAIRS, index.shortest_run)
+    # Without images there is room for more.
+    further = _FURTHER_PAIRS if any(sequence.images.size for sequence in sequences) else 3 * pairs
+    longer = min(pairs + further, index.shortest_run)
     return index if longer == pairs else WindowIndex(sequences, longer, split="validation")
 
 
-def _constant_score(training: Split, windows: WindowIndex, context: int, options: TrainerOptions) -> Score:
-    """Of the pairs that validation answers, and no others."""
-    motion = mean_motion(training.sequences)
+def _reference(training: Split, windows: WindowIndex, context: int, options: TrainerOptions) -> tuple[str, Score]:
+    """What stands beside the parts, and its score on the pairs that validation answers, and no others."""
+    constant = mean_motion(training.sequences)
+    motions = [np.tile(constant, (len(sequence) - 1, 1, 1)) for sequence in windows.sequences]
+    beside = "constant motion"
+    for motion, sequence in zip(motions, windows.sequences, strict=True):
+        if sequence.vo is not None:
+            beside = "the VO alone"
+            motion[sequence.vo.valid] = sequence.vo.T_prev_cur[sequence.vo.valid]
     answered = [np.zeros(len(sequence) - 1, dtype=np.bool_) for sequence in windows.sequences]
     for usable, sequence in zip(answered, windows.sequences, strict=True):
         for place in range(context - 1, windows.pairs):
             usable[sequence.starts(windows.pairs) + place] = True
-    return score_motions(
+    return beside, score_motions(
         windows.sequences,
-        [np.tile(motion, (len(sequence) - 1, 1, 1)) for sequence in windows.sequences],
+        motions,
         answered,
         lengths_m=[float(length) for length in options.segment_lengths_m],
         step=options.segment_step,
@@ -250,7 +263,8 @@ def _fit(trainer: lightning.Trainer, module: TrainingModule, data: WindowData, o
         signal.signal(signal.SIGINT, before)
 
 
-def _result(best: BestWeights, curve: Curve, trained: Mapping[str, Trainable], constant: Score) -> Trained:
+def _best(best: BestWeights, trained: Mapping[str, Trainable]) -> tuple[dict[str, Path], Score | None]:
+    """Files of the best weights, which the parts then have, and their score."""
     weights: dict[str, Path] = {}
     score = None
     if best.best:
@@ -261,11 +275,11 @@ def _result(best: BestWeights, curve: Curve, trained: Mapping[str, Trainable], c
             part.net.eval()
         figures = read_card(next(iter(weights.values())))["validation"]
         score = Score(**{each.name: figures[each.name] for each in fields(Score)})
-    return Trained(weights=weights, score=score, constant=constant, epochs=len(curve.rows), curve=curve.rows)
+    return weights, score
 
 
 def _card(
-    training: Split, validation: Split, options: TrainerOptions, about: Mapping[str, object], constant: Score
+    training: Split, validation: Split, options: TrainerOptions, about: Mapping[str, object]
 ) -> dict[str, object]:
     data = {"training": training.about(), "validation": validation.about()}
     return {
@@ -275,7 +289,6 @@ def _card(
         "licence": "Apache-2.0, beside the terms of the data, and of the weights it may have started from",
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "trainer": options.settings(),
-        "constant_motion": asdict(constant),
         **about,
     }
 
@@ -284,7 +297,7 @@ def _figures(module: TrainingModule, options: TrainerOptions) -> dict[str, objec
     score = module.score
     if score is None:
         return {}
-    figures = {**asdict(score), "relative_to_constant_motion": module.rank_value}
+    figures = {**asdict(score), "relative_to_reference": module.rank_value}
     lengths = [float(length) for length in options.segment_lengths_m]
     finite = {name: value if math.isfinite(value) else None for name, value in figures.items()}
     return {"validation": {**finite, "segment_lengths_m": lengths, "protocol": _PROTOCOL}}

@@ -19,8 +19,13 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-def trainer_options(config: DictConfig, choices: Mapping[str, str]) -> "TrainerOptions":
+def trainer_options(config: DictConfig, choices: Mapping[str, str], *, answers: bool = False) -> "TrainerOptions":
     """The options of ``trainer=``.
+
+    Args:
+        config: the whole.
+        choices: by group, for messages.
+        answers: whether a fuser is to be trained on what a VO answered, as ``trainer.fusion`` says.
 
     Raises:
         ConfigError: no trainer or no training data was chosen, or an option that cannot work.
@@ -30,16 +35,28 @@ def trainer_options(config: DictConfig, choices: Mapping[str, str]) -> "TrainerO
     for group, example in (("trainer", "cpu"), ("training_data", "simulated_car")):
         if not config.get(group):
             raise ConfigError(f"{group}={choices.get(group, 'none')} does not say how to train: add {group}={example}")
+    if answers:
+        plain = OmegaConf.create({"trainer": OmegaConf.to_container(config.trainer, resolve=True)})
+        plain.trainer = OmegaConf.merge(plain.trainer, plain.trainer.fusion, {"fusion": {}})
+        config = plain
     return build(config, "trainer", TrainerOptions, choices.get("trainer", ""))
 
 
-def trainable_parts(config: DictConfig, choices: Mapping[str, str], seed: int) -> dict[str, Trainable]:
-    """The parts of ``config`` that have a net, by slot, in the order of the pipeline.
+def learns_from_answers(part: Trainable) -> bool:
+    """Whether a part is trained by itself, on what the parts before it answered; see :class:`Trainable`."""
+    return getattr(part, "learns_from", "images") == "answers"
+
+
+def trainable_parts(
+    config: DictConfig, choices: Mapping[str, str], seed: int, *, answers: bool = False
+) -> dict[str, Trainable]:
+    """The parts of ``config`` that have a net and are trained together, by slot, in the order of the pipeline.
 
     Args:
         config: the whole.
         choices: by group, for messages.
         seed: of their first weights.
+        answers: take those that learn from what a VO answered, else those that learn from images.
 
     Raises:
         ConfigError: there is none, or the parts do not fit together.
@@ -48,7 +65,11 @@ def trainable_parts(config: DictConfig, choices: Mapping[str, str], seed: int) -
 
     seed_everything(seed)
     filled = build_pipeline(config, choices).parts()
-    parts: dict[str, Trainable] = {slot: part for slot, part in filled.items() if isinstance(part, Trainable)}
+    parts: dict[str, Trainable] = {
+        slot: part
+        for slot, part in filled.items()
+        if isinstance(part, Trainable) and learns_from_answers(part) == answers
+    }
     if not parts:
         told = ", ".join(f"{slot}={choices.get(slot, '')}" for slot in filled)
         raise ConfigError(f"task=train has nothing to train: none of {told} has a net; choose a part that has one")
@@ -97,13 +118,14 @@ def fit_parts(
     trained = train_parts(parts, *splits, options, folder=folder, tracker=tracker, about=about, shown=shown)
     if trained.score is not None:
         log.info(
-            "best of %d epochs on the validation recordings: t_rel %.2f %%, r_rel %.2f °/100 m (constant motion: "
+            "best of %d epochs on the validation recordings: t_rel %.2f %%, r_rel %.2f °/100 m (%s: "
             "%.2f %%, %.2f °/100 m; %d segments)",
             trained.epochs,
             trained.score.t_rel_percent,
             trained.score.r_rel_deg_per_100m,
-            trained.constant.t_rel_percent,
-            trained.constant.r_rel_deg_per_100m,
+            trained.beside,
+            trained.reference.t_rel_percent,
+            trained.reference.r_rel_deg_per_100m,
             trained.score.segments,
         )
     for path in trained.weights.values():

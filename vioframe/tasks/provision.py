@@ -1,16 +1,19 @@
 """Weights for the parts of an experiment that have none: trained once, then found again by what they came from.
 
+There are two stages. Parts that learn from images are trained together. A fuser that learns from what a VO answers is
+trained after them, by itself: the VO is asked for the recordings once (:mod:`vioframe.tasks.answers`).
+
 What is trained lies in ``trainer.cache/trained/<parts>-<key>``. The key is a hash of all that has a bearing on it:
-the trainer's options, the configuration of the parts, the content of both splits and the version of this package.
-A training that was stopped goes on when the same command is given again.
+the trainer's options, the configuration of the parts, the content of both splits, answers included, and the version of
+this package. A training that was stopped goes on when the same command is given again.
 """
 
 import hashlib
 import json
 import logging
 import os
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,8 +26,10 @@ from vioframe.errors import ConfigError, DataError
 from vioframe.interfaces import Trainable
 from vioframe.learning import require_torch
 from vioframe.pipeline import Pipeline
+from vioframe.tasks.answers import read_answered_splits
+from vioframe.tasks.bearing import bearing_of
 from vioframe.tasks.decoding import read_splits
-from vioframe.tasks.fitting import fit_parts, trainable_parts, trainer_options
+from vioframe.tasks.fitting import fit_parts, learns_from_answers, trainable_parts, trainer_options
 from vioframe.tracking import Tracker
 
 if TYPE_CHECKING:
@@ -61,57 +66,135 @@ def provide_weights(
         DataError: recordings that cannot be learned from.
         KeyboardInterrupt: the user stopped the training; it can go on.
     """
-    slots = untrained_slots(pipeline)
-    told = " and ".join(f"{slot}={choices.get(slot, '')}" for slot in slots)
-    require_torch(f"training {told}", training=True)
-    options = _options(config, choices, slots, told)
-    splits = read_splits(config, options, choices, shown=shown)
-    _warn_of_leak(splits, tested)
-    key = _key(config, options, _with_nets(pipeline), splits)
-    name = "-".join(choices.get(slot, slot) for slot in options.train or ())
-    place = Path(options.cache).expanduser() / "trained" / f"{name}-{key[:16]}"
-    found = _trained(place)
-    if not found:
-        from filelock import FileLock
-
-        place.mkdir(parents=True, exist_ok=True)
-        # Jobs of a sweep may want the same weights: the first trains, the others wait for it.
-        with FileLock(place / "lock"):
-            found = _trained(place) or _train(config, choices, options, splits, place, shown=shown)
-    else:
-        log.info("%s was trained before: %s", told, place)
-    for slot, file in found.items():
-        OmegaConf.update(config, f"{slot}.weights", str(place / file))
+    nets = _with_nets(pipeline)
+    untrained = untrained_slots(pipeline)
+    for answers in (False, True):
+        slots = [slot for slot in untrained if learns_from_answers(nets[slot]) == answers]
+        if slots:
+            together = [slot for slot, part in nets.items() if learns_from_answers(part) == answers]
+            _Stage(config, choices, slots, together, answers=answers).provide(tested, shown=shown)
 
 
 def _with_nets(pipeline: Pipeline) -> dict[str, Trainable]:
     return {slot: part for slot, part in pipeline.parts().items() if isinstance(part, Trainable)}
 
 
-def _options(config: DictConfig, choices: Mapping[str, str], slots: list[str], told: str) -> "TrainerOptions":
-    """The trainer's options, for ``slots``."""
-    try:
-        options = trainer_options(config, choices)
-    except ConfigError as error:
-        given = " ".join(f"{slot}.weights=FILE" for slot in slots)
-        raise ConfigError(f"{told} has no weights: give {given}, or have it trained first ({error})") from error
-    if options.devices > 1:
-        raise ConfigError(
-            f"trainer.devices={options.devices}: an experiment trains {told} in one process; train it with task=train "
-            "first, and give its weights"
-        )
-    if options.resume is not None:
-        raise ConfigError(
-            f"trainer.resume={options.resume}: an experiment goes on by itself with what it was training; use it with "
-            "task=train"
-        )
-    left = [slot for slot in slots if options.train is not None and slot not in options.train]
-    if left:
-        raise ConfigError(
-            f"trainer.train={list(options.train or ())} leaves {', '.join(left)} without weights: add it, or give its "
-            "weights"
-        )
-    return options if options.train is not None else replace(options, train=slots)
+@dataclass(frozen=True, slots=True)
+class _Stage:
+    """Parts that are trained together.
+
+    Attributes:
+        config: the whole; changed in place.
+        choices: by group.
+        slots: of the parts that need weights.
+        together: of all parts that take part.
+        answers: whether they learn from what a VO answers.
+    """
+
+    config: DictConfig
+    choices: Mapping[str, str]
+    slots: Sequence[str]
+    together: Sequence[str]
+    answers: bool
+
+    @property
+    def told(self) -> str:
+        """What is trained, as the user chose it."""
+        return " and ".join(f"{slot}={self.choices.get(slot, '')}" for slot in self.slots)
+
+    def provide(self, tested: Dataset, *, shown: bool) -> None:
+        """Train, or find what was trained; arguments and errors as of :func:`provide_weights`."""
+        require_torch(f"training {self.told}", training=True)
+        options = self._options()
+        read = read_answered_splits if self.answers else read_splits
+        splits = read(self.config, options, self.choices, shown=shown)
+        _warn_of_leak(splits, tested)
+        name = "-".join(self.choices.get(slot, slot) for slot in options.train or ())
+        place = Path(options.cache).expanduser() / "trained" / f"{name}-{self._key(options, splits)[:16]}"
+        found = _trained(place)
+        if not found:
+            from filelock import FileLock
+
+            place.mkdir(parents=True, exist_ok=True)
+            # Jobs of a sweep may want the same weights: the first trains, the others wait for it.
+            with FileLock(place / "lock"):
+                found = _trained(place) or self._train(options, splits, place, shown=shown)
+        else:
+            log.info("%s was trained before: %s", self.told, place)
+        for slot, file in found.items():
+            OmegaConf.update(self.config, f"{slot}.weights", str(place / file))
+
+    def _options(self) -> "TrainerOptions":
+        try:
+            options = trainer_options(self.config, self.choices, answers=self.answers)
+        except ConfigError as error:
+            given = " ".join(f"{slot}.weights=FILE" for slot in self.slots)
+            raise ConfigError(
+                f"{self.told} has no weights: give {given}, or have it trained first ({error})"
+            ) from error
+        if options.devices > 1:
+            raise ConfigError(
+                f"trainer.devices={options.devices}: an experiment trains {self.told} in one process; train it with "
+                "task=train first, and give its weights"
+            )
+        if options.resume is not None:
+            raise ConfigError(
+                f"trainer.resume={options.resume}: an experiment goes on by itself with what it was training; use it "
+                "with task=train"
+            )
+        if options.train is None or self.answers:
+            return replace(options, train=list(self.slots))
+        left = [slot for slot in self.slots if slot not in options.train]
+        if left:
+            raise ConfigError(
+                f"trainer.train={list(options.train)} leaves {', '.join(left)} without weights: add it, or give its "
+                "weights"
+            )
+        # What learns from answers comes after, by itself.
+        return replace(options, train=[slot for slot in options.train if slot in self.together])
+
+    def _key(self, options: "TrainerOptions", splits: "tuple[Split, Split]") -> str:
+        # Other parts take no part in a training, but for what they answered, which the splits bring.
+        used = {slot: bearing_of(self.config, slot) for slot in self.together}
+        words = [__version__, options.settings(), used, [split.hashes for split in splits]]
+        return hashlib.sha256(json.dumps(words, sort_keys=True, default=str).encode()).hexdigest()
+
+    def _train(
+        self, options: "TrainerOptions", splits: "tuple[Split, Split]", place: Path, *, shown: bool
+    ) -> dict[str, str]:
+        resume = place / "resume.ckpt"
+        again = resume.is_file()
+        log.info("%s %s in %s", "going on to train" if again else "training", ", ".join(options.train or ()), place)
+        (place / "config.yaml").write_text(OmegaConf.to_yaml(self.config, resolve=True), encoding="utf-8")
+        parts = trainable_parts(self.config, self.choices, options.seed, answers=self.answers)
+        with build(self.config, "tracker", Tracker, self.choices.get("tracker", "")) as tracker:
+            try:
+                trained = fit_parts(
+                    parts,
+                    splits,
+                    replace(options, resume=str(resume) if again else None),
+                    config=self.config,
+                    choices=self.choices,
+                    folder=place,
+                    tracker=tracker,
+                    shown=shown,
+                )
+            except KeyboardInterrupt:
+                log.warning("training was interrupted; the same command goes on with it")
+                tracker.finish("killed", "interrupted by the user")
+                raise
+        if not trained.weights:
+            raise ConfigError(
+                f"trainer.max_minutes={options.max_minutes} ended the training before its first validation: give it "
+                "more"
+            )
+        found = {slot: path.relative_to(place).as_posix() for slot, path in trained.weights.items()}
+        partial = place / f"{_RESULT}.partial"
+        partial.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+        os.replace(partial, place / _RESULT)
+        # It is of no more use, and three times as large as the weights.
+        resume.unlink(missing_ok=True)
+        return found
 
 
 def _warn_of_leak(splits: "tuple[Split, Split]", tested: Dataset) -> None:
@@ -121,27 +204,6 @@ def _warn_of_leak(splits: "tuple[Split, Split]", tested: Dataset) -> None:
     both = sorted(name for name in tested.sequences if name.partition(".")[0] in learned)
     if both:
         log.warning("%s is learned from and tested on: these figures are not those of unseen data", ", ".join(both))
-
-
-def _key(
-    config: DictConfig, options: "TrainerOptions", parts: Mapping[str, Trainable], splits: "tuple[Split, Split]"
-) -> str:
-    # Parts without a net take no part in a training.
-    used = {slot: _bearing(OmegaConf.to_container(config[slot], resolve=True)) for slot in parts}
-    words = [__version__, options.settings(), used, [split.hashes for split in splits]]
-    return hashlib.sha256(json.dumps(words, sort_keys=True, default=str).encode()).hexdigest()
-
-
-def _bearing(node: object) -> object:
-    """What of a part's options has a bearing on what it learns: of files it starts from the content, not the name."""
-    if not isinstance(node, dict):
-        return node
-    kept = {name: _bearing(value) for name, value in node.items() if name not in ("device", "cache")}
-    source = kept.get("weights")
-    if isinstance(source, str) and Path(source).expanduser().is_file():
-        with Path(source).expanduser().open("rb") as file:
-            kept["weights"] = hashlib.file_digest(file, "sha256").hexdigest()
-    return kept
 
 
 def _trained(place: Path) -> dict[str, str]:
@@ -155,46 +217,3 @@ def _trained(place: Path) -> dict[str, str]:
             f"{place / _RESULT} is damaged ({error}): delete the folder, and it is trained again"
         ) from error
     return found if all((place / name).is_file() for name in found.values()) else {}
-
-
-def _train(
-    config: DictConfig,
-    choices: Mapping[str, str],
-    options: "TrainerOptions",
-    splits: "tuple[Split, Split]",
-    place: Path,
-    *,
-    shown: bool,
-) -> dict[str, str]:
-    resume = place / "resume.ckpt"
-    again = resume.is_file()
-    log.info("%s %s in %s", "going on to train" if again else "training", ", ".join(options.train or ()), place)
-    (place / "config.yaml").write_text(OmegaConf.to_yaml(config, resolve=True), encoding="utf-8")
-    parts = trainable_parts(config, choices, options.seed)
-    with build(config, "tracker", Tracker, choices.get("tracker", "")) as tracker:
-        try:
-            trained = fit_parts(
-                parts,
-                splits,
-                replace(options, resume=str(resume) if again else None),
-                config=config,
-                choices=choices,
-                folder=place,
-                tracker=tracker,
-                shown=shown,
-            )
-        except KeyboardInterrupt:
-            log.warning("training was interrupted; the same command goes on with it")
-            tracker.finish("killed", "interrupted by the user")
-            raise
-    if not trained.weights:
-        raise ConfigError(
-            f"trainer.max_minutes={options.max_minutes} ended the training before its first validation: give it more"
-        )
-    found = {slot: path.relative_to(place).as_posix() for slot, path in trained.weights.items()}
-    partial = place / f"{_RESULT}.partial"
-    partial.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
-    os.replace(partial, place / _RESULT)
-    # It is of no more use, and three times as large as the weights.
-    resume.unlink(missing_ok=True)
-    return found

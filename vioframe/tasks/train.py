@@ -1,18 +1,24 @@
-"""``task=train``: train the parts that have a net, together, and keep the weights that do best in validation."""
+"""``task=train``: train the parts that have a net, together, and keep the weights that do best in validation.
+
+A fuser that learns from what a VO answers is trained by itself, and the VO has to know its answers by then.
+"""
 
 import logging
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from vioframe.build import build
-from vioframe.errors import DataError
+from vioframe.build import build, build_pipeline
+from vioframe.errors import ConfigError, DataError
+from vioframe.interfaces import Trainable
 from vioframe.learning import require_torch
+from vioframe.tasks.answers import read_answered_splits
 from vioframe.tasks.decoding import read_splits
-from vioframe.tasks.fitting import fit_parts, trainable_parts, trainer_options
+from vioframe.tasks.fitting import fit_parts, learns_from_answers, trainable_parts, trainer_options
 from vioframe.tasks.interruption import INTERRUPTED, terminate_like_interrupt
 from vioframe.tracking import NullTracker, Tracker
 
@@ -27,10 +33,11 @@ def run(config: DictConfig) -> int:
     # With trainer.devices=2 lightning starts this command again for each further process; one speaks for all.
     follows = int(os.environ.get("LOCAL_RANK", "0")) > 0
     shown = bool(config.progress) and hydra_config.mode != RunMode.MULTIRUN and not follows
-    options = trainer_options(config, choices)
+    answers = _learns_from_answers(config, choices)
+    options = trainer_options(config, choices, answers=answers)
     if options.resume is not None and not Path(options.resume).expanduser().is_file():
         raise DataError(f"trainer.resume={options.resume}: there is no such file; a run writes resume.ckpt each epoch")
-    parts = trainable_parts(config, choices, options.seed)
+    parts = trainable_parts(config, choices, options.seed, answers=answers)
     # A run that goes on goes on where it was: its weights and its curve are there.
     output = Path(hydra_config.runtime.output_dir)
     folder = output if options.resume is None else Path(options.resume).expanduser().parent
@@ -38,7 +45,7 @@ def run(config: DictConfig) -> int:
     output.mkdir(parents=True, exist_ok=True)
     (output / "config.yaml").write_text(OmegaConf.to_yaml(config, resolve=True), encoding="utf-8")
     with terminate_like_interrupt(), tracker:
-        splits = read_splits(config, options, choices, shown=shown)
+        splits = (read_answered_splits if answers else read_splits)(config, options, choices, shown=shown)
         try:
             trained = fit_parts(
                 parts, splits, options, config=config, choices=choices, folder=folder, tracker=tracker, shown=shown
@@ -62,3 +69,27 @@ def run(config: DictConfig) -> int:
         for slot, path in trained.weights.items():
             log.info("weights of %s: %s (use them with %s.weights=...)", slot, path, slot)
     return 0
+
+
+def _learns_from_answers(config: DictConfig, choices: Mapping[str, str]) -> bool:
+    """Whether it is the fuser that is to be trained, on what the VO answers.
+
+    Raises:
+        ConfigError: the VO has no weights yet, so it cannot be asked.
+    """
+    nets = {slot: part for slot, part in build_pipeline(config, choices).parts().items() if isinstance(part, Trainable)}
+    later = [slot for slot, part in nets.items() if learns_from_answers(part)]
+    chosen = OmegaConf.select(config, "trainer.train")
+    if not later or (chosen is not None and not set(chosen) & set(later)):
+        return False
+    untaught = [slot for slot, part in nets.items() if slot not in later and part.needs_training]
+    if untaught:
+        told, before = (
+            " and ".join(f"{slot}={choices.get(slot, '')}" for slot in slots) for slots in (later, untaught)
+        )
+        first = ",".join(untaught)
+        raise ConfigError(
+            f"{told} learns from what {before} answers, which has no weights: train it first (trainer.train=[{first}]) "
+            f"and give {untaught[0]}.weights=FILE, or run the experiment (task=experiment), which does both"
+        )
+    return True

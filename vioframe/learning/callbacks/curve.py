@@ -90,7 +90,7 @@ class Curve(Callback):
         if isinstance(pl_module, TrainingModule) and score is not None and "validation/loss" in row:
             row["validation/t_rel_percent"] = score.t_rel_percent
             row["validation/r_rel_deg_per_100m"] = score.r_rel_deg_per_100m
-            row["validation/relative_to_constant_motion"] = pl_module.rank_value
+            row["validation/relative_to_reference"] = pl_module.rank_value
         self.rows.append(row)
         if trainer.is_global_zero:
             write_rows(self._folder / CURVE_FILE, self.rows)

@@ -111,15 +111,17 @@ class CurvePicture(Callback):
 
     Args:
         curve: whose rows are drawn; comes before this one.
-        constant: score of constant motion on the validation recordings, for comparison.
+        reference: score to compare with, on the validation recordings.
+        beside: what it is of.
         folder: of ``curve.png``.
         tracker: of the run.
     """
 
     _SHARE = 0.03
 
-    def __init__(self, curve: Curve, constant: Score, folder: Path, tracker: Tracker) -> None:
-        self._constant = constant
+    def __init__(self, curve: Curve, reference: Score, beside: str, folder: Path, tracker: Tracker) -> None:
+        self._reference = reference
+        self._beside = beside
         self._curve = curve
         self._path = folder / "curve.png"
         self._tracker = tracker
@@ -153,5 +155,5 @@ class CurvePicture(Callback):
         self._drawn_rows = len(rows)
         from vioframe.learning.pictures import draw_curve
 
-        draw_curve(self._path, rows, self._constant)
+        draw_curve(self._path, rows, self._reference, self._beside)
         self._tracker.log_file(self._path, "plots")
