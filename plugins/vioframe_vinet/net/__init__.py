@@ -1,0 +1,1 @@
+"""Tensors only: encoder of image pairs, encoder of inertial samples, core, loss."""

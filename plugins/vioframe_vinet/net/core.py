@@ -1,0 +1,168 @@
+"""The core of VINet: what two images show and what the IMU felt, remembered by an LSTM, into motions.
+
+Clark, Wang, Wen, Markham, Trigoni, "VINet: Visual-Inertial Odometry as a Sequence-to-Sequence Learning Problem",
+AAAI 2017.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from vioframe.learning.motion import exp_so3, from_parts, log_so3, product
+from vioframe_vinet.net.inertial import InertialEncoder, Resampled, turn_by_gyro
+
+_MOTION = 6
+# What a feature of 1 means: s between images, m of the pose that is fed back.
+_DURATION_UNIT, _PLACE_UNIT = 0.1, 10.0
+
+
+class CoreState(NamedTuple):
+    """What the net goes on from.
+
+    Attributes:
+        hidden, cell: (layers, B, hidden).
+        T_first_prev: (B, 4, 4) pose since it began to remember.
+    """
+
+    hidden: Tensor
+    cell: Tensor
+    T_first_prev: Tensor
+
+
+class Seen(NamedTuple):
+    """S pairs of images in a row, of B sequences.
+
+    Attributes:
+        embedding: (B, S, D); anything where not visible.
+        visible: (B, S) bool, whether there are both images.
+        samples: of the B · S pairs, those of one sequence together, in the axes of the answer.
+        duration_s: (B, S) between the images.
+    """
+
+    embedding: Tensor
+    visible: Tensor
+    samples: Resampled
+    duration_s: Tensor
+
+
+class CoreAnswer(NamedTuple):
+    """What the net answers.
+
+    Attributes:
+        T_prev_cur: (B, S, 4, 4) motions.
+        vector: (B, S, 6) the same as (rotation vector rad, translation m).
+        log_variances: (B, S, 6) of its errors, in units of the output, or None.
+    """
+
+    T_prev_cur: Tensor
+    vector: Tensor
+    log_variances: Tensor | None
+
+
+class VinetCore(nn.Module):
+    """Inertial encoder, core LSTM, two linear layers."""
+
+    def __init__(
+        self,
+        *,
+        embedding: int,
+        imu_intervals: int,
+        imu_hidden: int,
+        imu_layers: int,
+        hidden: int,
+        layers: int,
+        joined: int,
+        dropout: float,
+        log_variances: bool,
+        gyro_turns: bool,
+        feed_back_pose: bool,
+        rotation_unit_rad: float,
+        translation_unit_m: float,
+    ) -> None:
+        """Build the net.
+
+        Args:
+            embedding: D, numbers of the front end.
+            imu_intervals: to which the samples of a pair are brought.
+            imu_hidden, imu_layers: of the LSTM over them.
+            hidden, layers: of the core's.
+            joined: neurons of the layer before the answer.
+            dropout: in training, after the core and between its layers.
+            log_variances: answer with variances too.
+            gyro_turns: answer with what is to be added to the gyro's rotation, instead of all of it.
+            feed_back_pose: let the core see the pose since it began to remember.
+            rotation_unit_rad, translation_unit_m: what an output of 1 means.
+        """
+        super().__init__()
+        self.imu_intervals = imu_intervals
+        self._gyro_turns, self._feed_back = gyro_turns, feed_back_pose
+        self._units = (rotation_unit_rad, translation_unit_m)
+        self.inertial = InertialEncoder(hidden=imu_hidden, layers=imu_layers)
+        # What stands in for a sensor that is missing.
+        self.unseen = nn.Parameter(torch.zeros(embedding))
+        self.unheard = nn.Parameter(torch.zeros(imu_hidden))
+        inputs = embedding + imu_hidden + 3 + (_MOTION if feed_back_pose else 0)
+        # Torch warns of a dropout between the layers of a single one.
+        self.core = nn.LSTM(inputs, hidden, layers, batch_first=True, dropout=dropout if layers > 1 else 0.0)
+        for name, parameter in self.core.named_parameters():
+            if name.startswith("bias_ih"):
+                # Gates in torch's order: input, forget, cell, output. An open forget gate lets gradients reach back
+                # through the window from the first step (Jozefowicz et al., ICML 2015).
+                with torch.no_grad():
+                    parameter[hidden : 2 * hidden].fill_(1.0)
+        self.joined = nn.Sequential(nn.Dropout(dropout), nn.Linear(hidden, joined), nn.ReLU(inplace=True))
+        self.answer = nn.Linear(joined, 2 * _MOTION if log_variances else _MOTION)
+        # At first close to no motion, or to the gyro's rotation, whatever it sees.
+        nn.init.normal_(self.answer.weight, std=0.1 * joined**-0.5)
+        nn.init.zeros_(self.answer.bias)
+
+    def begin(self, sequences: int) -> CoreState:
+        """The state of sequences that begin."""
+        weight = self.answer.weight
+        shape = (self.core.num_layers, sequences, self.core.hidden_size)
+        identity = torch.eye(4, dtype=torch.float32, device=weight.device).expand(sequences, 4, 4)
+        return CoreState(weight.new_zeros(shape), weight.new_zeros(shape), identity)
+
+    def forward(self, seen: Seen, state: CoreState | None = None) -> tuple[CoreAnswer, CoreState]:
+        """Motions over the pairs, and the state to go on from; without a state the sequences begin."""
+        batch, pairs = seen.visible.shape
+        state = state or self.begin(batch)
+        features = self.inertial(seen.samples.means)
+        features = torch.where(seen.samples.heard[:, None], features, self.unheard.to(features.dtype))
+        heard = seen.samples.heard.reshape(batch, pairs)
+        embedding = torch.where(seen.visible[..., None], seen.embedding, self.unseen.to(seen.embedding.dtype))
+        told = [seen.visible.to(embedding.dtype), heard.to(embedding.dtype), seen.duration_s / _DURATION_UNIT - 1.0]
+        inputs = torch.cat([embedding, features.reshape(batch, pairs, -1), torch.stack(told, dim=-1)], dim=-1)
+        turns = None
+        if self._gyro_turns:
+            turns = turn_by_gyro(seen.samples).reshape(batch, pairs, 3, 3)
+        if not self._feed_back:
+            remembered, (hidden, cell) = self.core(inputs, (state.hidden, state.cell))
+            # Nobody asks for the pose.
+            return self._answer(remembered, turns), CoreState(hidden, cell, state.T_first_prev)
+        answers = []
+        for k in range(pairs):
+            pose = state.T_first_prev
+            place = torch.cat([log_so3(pose[:, :3, :3]), pose[:, :3, 3] / _PLACE_UNIT], dim=-1)
+            step = torch.cat([inputs[:, k], place.to(inputs.dtype)], dim=-1)[:, None]
+            remembered, (hidden, cell) = self.core(step, (state.hidden, state.cell))
+            answers.append(self._answer(remembered, None if turns is None else turns[:, k : k + 1]))
+            state = CoreState(hidden, cell, product(pose, answers[-1].T_prev_cur[:, 0]))
+        variances = [each.log_variances for each in answers if each.log_variances is not None]
+        answer = CoreAnswer(
+            torch.cat([each.T_prev_cur for each in answers], dim=1),
+            torch.cat([each.vector for each in answers], dim=1),
+            torch.cat(variances, dim=1) if variances else None,
+        )
+        return answer, state
+
+    def _answer(self, remembered: Tensor, turns: Tensor | None) -> CoreAnswer:
+        # Single precision even where the layers before ran in half: a rotation of 0.01° would not survive that.
+        numbers = self.answer(self.joined(remembered)).float()
+        R = exp_so3(self._units[0] * numbers[..., :3])
+        if turns is not None:
+            R = product(turns.float(), R)
+        p = self._units[1] * numbers[..., 3:_MOTION]
+        vector = torch.cat([log_so3(R), p], dim=-1)
+        return CoreAnswer(from_parts(R, p), vector, numbers[..., _MOTION:] if numbers.shape[-1] > _MOTION else None)

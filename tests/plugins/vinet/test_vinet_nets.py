@@ -1,0 +1,204 @@
+"""The nets of VINet: samples at one rate, composition with gradient, covariances, and that it learns."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs torch: pip install 'vioframe[learn]'")
+pytest.importorskip("safetensors", reason="needs safetensors: pip install 'vioframe[learn]'")
+
+import torch
+
+from learned_scenes import stored
+from vioframe.data.windows import cut_window
+from vioframe.geometry import se3
+from vioframe.learning.batch import collate
+from vioframe.learning.motion import compose, exp_so3, motion_from_vector
+from vioframe.pose_chain import PoseChain
+from vioframe.testing import make_scene
+from vioframe.types import ImuBlock
+from vioframe_vinet import PairEncoder, VinetFuser
+from vioframe_vinet.net.core import CoreAnswer
+from vioframe_vinet.net.inertial import Resampled, resample, turn_by_gyro
+from vioframe_vinet.net.loss import (
+    PoseErrors,
+    PoseLikelihood,
+    composed_covariance,
+    motion_errors,
+    negative_log_likelihood,
+    tangent_errors,
+)
+from vioframe_vinet.net.seeing import stretches
+
+UNITS = torch.tensor([0.005] * 3 + [1.0] * 3, dtype=torch.float64)
+
+
+def some_motions(batch=3, pairs=5, seed=0):
+    torch.manual_seed(seed)
+    vectors = torch.randn(batch, pairs, 6, dtype=torch.float64) * torch.tensor([0.05] * 3 + [0.8] * 3)
+    return vectors, motion_from_vector(vectors)
+
+
+@pytest.mark.parametrize("count", [2, 5, 11, 12, 37])
+def test_resampling_keeps_every_integral(count):
+    """Of samples that are linear in between, against the trapezoid rule on a grid a thousand times as fine."""
+    rng = np.random.default_rng(count)
+    times = np.sort(np.concatenate([[0.0, 0.1], rng.uniform(0.0, 0.1, count - 2)]))
+    values = rng.standard_normal((count, 6))
+    fine = np.linspace(0.0, 0.1, 10_001)
+    dense = np.stack([np.interp(fine, times, values[:, axis]) for axis in range(6)], axis=1)
+    expected = [np.trapezoid(dense[k : k + 1001], fine[k : k + 1001], axis=0) / 0.01 for k in range(0, 10_000, 1000)]
+    padded = torch.zeros(1, count + 3, 6, dtype=torch.float64)
+    padded[0, :count] = torch.from_numpy(values)
+    time_s = torch.zeros(1, count + 3, dtype=torch.float64)
+    time_s[0, :count] = torch.from_numpy(times)
+    mask = torch.arange(count + 3)[None] < count
+    found = resample(padded, time_s, mask, 10)
+    np.testing.assert_allclose(found.means[0], expected, atol=2e-4)
+    assert found.duration_s.item() == pytest.approx(0.1) and found.heard.item()
+
+
+def test_pairs_without_samples_are_told_and_finite():
+    imu = torch.randn(3, 4, 6)
+    time_s = torch.tensor([0.0, 0.03, 0.07, 0.1]).expand(3, 4)
+    mask = torch.tensor([[True] * 4, [True, False, False, False], [False] * 4])
+    found = resample(imu, time_s, mask, 5)
+    assert found.heard.tolist() == [True, False, False]
+    assert not found.means[1:].any() and found.means.isfinite().all()
+    torch.testing.assert_close(turn_by_gyro(found)[1:], torch.eye(3).expand(2, 3, 3))
+    empty = resample(torch.zeros(2, 0, 6), torch.zeros(2, 0), torch.zeros(2, 0, dtype=torch.bool), 5)
+    assert not empty.heard.any() and empty.means.shape == (2, 5, 6)
+
+
+def test_gyro_turns_by_its_integral():
+    rate = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
+    means = torch.zeros(1, 10, 6, dtype=torch.float64)
+    means[..., :3] = rate
+    samples = Resampled(means, torch.tensor([0.2], dtype=torch.float64), torch.tensor([True]))
+    torch.testing.assert_close(turn_by_gyro(samples)[0], exp_so3(0.2 * rate))
+
+
+@pytest.mark.parametrize("kind", ["errors", "likelihood"])
+def test_gradients_pass_through_the_composition_of_poses(kind):
+    """Analytic against central differences, to 1e-4, of a loss in which all that counts is the composed poses."""
+    vectors, _ = some_motions()
+    _, truth = some_motions(seed=1)
+    log_variances = UNITS.log() * 2 + 0.3 * torch.randn_like(vectors)
+    options = {"pose_weight": 1e3}
+    loss = PoseErrors(log_variance_rotation=-4.0, log_variance_translation=0.0, **options)
+    if kind == "likelihood":
+        loss = PoseLikelihood(rotation_unit_rad=0.05, translation_unit_m=1.0, **options)
+    loss.double()
+
+    def cost(numbers, spread):
+        return loss(CoreAnswer(motion_from_vector(numbers), numbers, None), truth, spread)["loss"]
+
+    vectors.requires_grad_(True)
+    log_variances.requires_grad_(True)
+    found = torch.autograd.grad(cost(vectors, log_variances), (vectors, log_variances), allow_unused=True)
+    rng = np.random.default_rng(0)
+    for argument, gradient in enumerate(found):
+        if gradient is None:
+            assert kind == "errors" and argument == 1
+            continue
+        for _ in range(8):
+            direction = torch.from_numpy(rng.standard_normal(vectors.shape))
+            step = 1e-5 * direction
+            moved = [
+                cost(
+                    *(
+                        (each + sign * step if number == argument else each)
+                        for number, each in enumerate((vectors, log_variances))
+                    )
+                )
+                for sign in (1, -1)
+            ]
+            numerical = (moved[0] - moved[1]).item() / 2e-5
+            assert (gradient * direction).sum().item() == pytest.approx(numerical, rel=1e-4)
+        # The first motion is taught by the last pose.
+        assert gradient[:, 0].abs().max() > 0
+
+
+def test_truth_costs_nothing_and_errors_are_those_of_the_house():
+    vectors, truth = some_motions()
+    assert motion_errors(truth, truth).abs().max() < 1e-12
+    tangent = 1e-4 * torch.randn(6, dtype=torch.float64)
+    disturbed = truth @ torch.from_numpy(se3.exp(tangent.numpy()))
+    np.testing.assert_allclose(tangent_errors(truth, disturbed), tangent.expand(3, 5, 6), atol=1e-7)
+    errors = PoseErrors(log_variance_rotation=0.0, log_variance_translation=0.0, pose_weight=1.0)
+    assert errors(CoreAnswer(truth, vectors, None), truth, None)["loss"].item() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_covariances_compose_as_a_stream_composes_them():
+    _, motions = some_motions(batch=1)
+    rng = np.random.default_rng(0)
+    roots = 0.1 * rng.standard_normal((5, 6, 6))
+    stated = torch.from_numpy(roots @ roots.transpose(0, 2, 1))
+    chain = PoseChain(levelled=False, tilt_sigma=1.0, rate_sigma=0.0, accel_sigma=0.0)
+    none = ImuBlock(stamps_ns=np.zeros(0, np.int64), gyro=np.zeros((0, 3)), accel=np.zeros((0, 3)))
+    chain.begin(0, None, none)
+    first = chain.state("tracking").covariance[:6, :6]
+    found = composed_covariance(motions, stated[None])[0].numpy()
+    poses = compose(motions)[0, 1:].numpy()
+    for k, (motion, covariance) in enumerate(zip(motions[0].numpy(), stated.numpy(), strict=True)):
+        chain.follow(motion, covariance, (k + 1) * 100_000_000)
+        state = chain.state("tracking")
+        into_state = np.eye(6)
+        into_state[3:, 3:] = poses[k, :3, :3]
+        back = into_state @ se3.adjoint(se3.inverse(poses[k]))
+        np.testing.assert_allclose(
+            state.covariance[:6, :6], into_state @ found[k] @ into_state.T + back @ first @ back.T, atol=1e-9
+        )
+
+
+def test_likelihood_is_that_of_a_gaussian():
+    torch.manual_seed(0)
+    root = torch.randn(6, 6, dtype=torch.float64)
+    covariance = UNITS[:, None] * (root @ root.T + torch.eye(6)) * UNITS
+    error = UNITS * torch.randn(6, dtype=torch.float64)
+    gaussian = torch.distributions.MultivariateNormal(torch.zeros(6, dtype=torch.float64), covariance)
+    constant = 3.0 * np.log(2 * np.pi) + UNITS.log().sum()
+    found = negative_log_likelihood(error, covariance, UNITS)
+    assert found.item() == pytest.approx((-gaussian.log_prob(error) - constant).item(), abs=1e-4)
+
+
+def test_stretches_are_one_run_in_their_share_of_windows():
+    torch.manual_seed(0)
+    found = stretches(4000, 9, 0.25)
+    assert found.any(1).float().mean().item() == pytest.approx(0.25, abs=0.03)
+    # One run: it begins once at most.
+    begins = found[:, :1].long().sum(1) + (found[:, 1:] & ~found[:, :-1]).sum(1)
+    assert begins.max() == 1
+    assert not stretches(50, 9, 0.0).any()
+
+
+@pytest.mark.parametrize("loss", ["likelihood", "learned"])
+def test_it_learns_a_short_scene_through_the_front_end(loss):
+    """One batch is learned by heart: translations that the untrained net does not know, and rotation stays right."""
+    torch.manual_seed(0)
+    front = PairEncoder(size_px=(96, 64), features=16, width=0.1, batch_norm=True, device="cpu")
+    options = {"embedding": 16, "window": 3, "imu_hidden": 8, "hidden": 32, "joined": 16, "dropout": 0.0}
+    options |= {"lost_images": 0.0, "lost_imu": 0.0}
+    fuser = VinetFuser(**options, translation_unit_m=0.1, loss=loss, device="cpu")
+    whole = stored(make_scene())
+    small = np.stack([cv2.resize(image, (96, 64), interpolation=cv2.INTER_AREA) for image in whole.images])
+    scene = dataclasses.replace(whole, images=small[..., None])
+    batch = collate([cut_window(scene, start, 4) for start in (0, 3, 6)]).as_float()
+    nets = torch.nn.ModuleList([front.net, fuser.net]).train()
+    optimizer = torch.optim.Adam(nets.parameters(), lr=4e-3)
+    seen = []
+    for _ in range(120):
+        losses = fuser.loss(fuser.forward_batch(batch, front.forward_batch(batch, {})), batch)
+        optimizer.zero_grad()
+        losses["loss"].backward()
+        optimizer.step()
+        seen.append((losses["translation"].item(), losses["rotation"].item()))
+        if len(seen) == 1:
+            for name, parameter in nets.named_parameters():
+                # Nothing was missing, so what stands in for it was not asked for.
+                if not name.endswith(("unseen", "unheard")):
+                    assert parameter.grad is not None and parameter.grad.isfinite().all(), name
+    assert seen[-1][0] < 0.25 * seen[0][0]
+    assert seen[-1][1] ** 0.5 < 0.02
