@@ -28,7 +28,9 @@ def window_of(measurements: list[Measurement], truth: Trajectory, rig: SensorRig
     if answers:
         vo = PairAnswers(
             T_prev_cur=np.array([np.eye(4) if p is None or not p.valid else p.T_prev_cur for p in poses]),
-            covariance=np.array([np.zeros((6, 6)) if p is None or p.covariance is None else p.covariance for p in poses]),
+            covariance=np.array(
+                [np.zeros((6, 6)) if p is None or p.covariance is None else p.covariance for p in poses]
+            ),
             valid=np.array([p is not None and p.valid for p in poses]),
         )
     return TrainingWindow(

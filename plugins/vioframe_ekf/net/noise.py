@@ -33,12 +33,13 @@ class FilterNoise(nn.Module):
 
     def visual_factors(self) -> Tensor:
         """(6,) on the standard deviations of the VO, rotation first."""
-        return self._factors(self.visual)
+        return self.factors(self.visual)
 
     def densities(self) -> Tensor:
         """(4,) as the argument of that name."""
         stated: Tensor = self.get_buffer("_stated")
-        return stated if self.inertial is None else stated * self._factors(self.inertial)
+        return stated if self.inertial is None else stated * self.factors(self.inertial)
 
-    def _factors(self, w: Tensor) -> Tensor:
+    def factors(self, w: Tensor) -> Tensor:
+        """Of standard deviations, for weights of any shape."""
         return 10.0 ** (0.5 * self.decades * torch.tanh(self.slope * w.double()))
