@@ -196,8 +196,8 @@ def follow(
     covariance = increment_covariance(samples.R, samples.v, duration_s, densities[:2])
     # Where there is no sample, what was integrated is nothing, and known to nobody.
     covariance = covariance * samples.there[..., None, None]
-    gap = torch.where(samples.there, samples.gap_s, duration_s)
-    gap = torch.where(gap > holes.allowed_s, gap, torch.zeros_like(gap))
+    hole = torch.where(samples.gap_s > holes.allowed_s, samples.gap_s, torch.zeros_like(duration_s))
+    gap = torch.where(samples.there, hole, duration_s)
     covariance = covariance + gap_covariance(gap, duration_s, holes.rate_sigma, holes.accel_sigma)
     transition, added = passing(duration_s, samples.jacobian, covariance, densities[2:].square().repeat_interleave(3))
     rows = motion_rows(motion)
