@@ -112,6 +112,8 @@ class StudySummary:
             return f"{spread.median:.{column.decimals}f} {metric_unit}".rstrip()
 
         start = self.spread(variant, study.reference, column)
+        if not any(cell.variant == variant for cell in self.results):
+            return f"{variant}: not run."
         if start is None:
             return f"{variant}: {name} is undefined at {at(study.reference)}."
         said = [f"{variant}: {name} {told(start)} at {at(study.reference)}"]
@@ -120,7 +122,8 @@ class StudySummary:
             low, high = stretch
             where = f"from {study.shown(low)} to {at(high)}" if low != high else "nowhere else"
             said.append(f"within {100.0 * study.tolerance:g} % of that {where}")
-        losses = {value: self.loss(variant, value, column) for value in study.all_values()}
+        run = {cell.value for cell in self.results if cell.variant == variant}
+        losses = {value: self.loss(variant, value, column) for value in study.all_values() if value in run}
         known = {value: loss for value, loss in losses.items() if loss is not None}
         worst = max(known, key=lambda value: known[value], default=study.reference)
         spread = self.spread(variant, worst, column)

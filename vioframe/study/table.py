@@ -21,8 +21,9 @@ def print_study(summary: StudySummary, console: "Console | None" = None) -> None
             console = Console(width=160)
     study, column = summary.study, summary.columns[0]
     seeds = f"median of {len(study.seeds)} seeds" if len(study.seeds) > 1 else f"seed {study.seeds[0]}"
-    table = Table(title=f"{study.title}: {column.title}, {seeds}", title_justify="left")
-    table.add_column(study.axis, overflow="fold")
+    # Units stand in brackets, which rich would take for its own.
+    table = Table(title=Text(f"{study.title}: {column.title}, {seeds}"), title_justify="left")
+    table.add_column(Text(study.axis), overflow="fold")
     for value in study.all_values():
         table.add_column(study.shown(value), justify="right")
     for variant in study.chosen:
