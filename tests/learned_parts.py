@@ -37,6 +37,7 @@ def options(folder, **changes) -> TrainerOptions:
         "width": 1.0,
         "dropout": 0.0,
         "channels": 1,
+        "recordings": None,
         "cache": str(folder / "cache"),
         "train": None,
         "optimizer": "adamw",

@@ -6,7 +6,8 @@ window holds does not, and is asked in a stream throughout.
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 import torch
@@ -59,37 +60,46 @@ class LearnedAnswers:
         # A front end that takes no part in training can only be asked in a stream.
         self.in_batches = isinstance(vo, Trainable) and len(self._parts) == 1 + (frontend is not None)
 
-    def answer(self, sequence: StoredSequence) -> PairAnswers:
-        """What it answers for all pairs of a recording with images, whose truth is not looked at."""
+    def answer(self, sequence: StoredSequence, progress: Callable[[int], None] = lambda done: None) -> PairAnswers:
+        """What it answers for all pairs of a recording with images.
+
+        Args:
+            sequence: the recording, whose truth is not looked at.
+            progress: told how many pairs are done.
+        """
         rig = SensorRig(cameras=(sequence.camera,), imu=_NO_NOISE, gravity=sequence.gravity)
         answers: dict[int, RelativePose] = {}
         for first, last in _runs(sequence):
-            answers.update(self._run(rig, sequence, first, last))
+            answers.update(self._run(rig, sequence, first, last, partial(_tell, progress, len(answers))))
         stamps = sequence.stamps_ns.tolist()
         return stack_answers(
             sequence.stamps_ns, {(stamps[pair], stamps[pair + 1]): pose for pair, pose in answers.items()}
         )
 
-    def _run(self, rig: SensorRig, sequence: StoredSequence, first: int, last: int) -> dict[int, RelativePose]:
+    def _run(
+        self, rig: SensorRig, sequence: StoredSequence, first: int, last: int, progress: Callable[[int], None]
+    ) -> dict[int, RelativePose]:
         """Answers by the number of the pair, of the unbroken images ``first`` to ``last``."""
         context = max((part.context_pairs for part in self._parts), default=1)
         if not self.in_batches or last - first < context:
-            return self._stream(rig, sequence, first, last)
+            return self._stream(rig, sequence, first, last, progress)
         # The first answers of a stream have less to look back at than a window has.
         begun = min(last, first + context - 1 + (0 if self._held else context + _FURTHER_PAIRS + _HELD_PAIRS))
-        streamed = self._stream(rig, sequence, first, begun)
-        batched = self._batch(sequence, first, last, context)
+        streamed = self._stream(rig, sequence, first, begun, progress)
+        batched = self._batch(sequence, first, last, context, progress)
         if not self._held:
             both = [(streamed[pair], batched[pair]) for pair in streamed if pair in batched]
             if not all(_alike(one, other) for one, other in both):
                 log.info("%s remembers more than a window holds: it is asked image by image", type(self._vo).__name__)
                 self.in_batches = False
-                return self._stream(rig, sequence, first, last)
+                return self._stream(rig, sequence, first, last, progress)
             # A run that begins and ends within one window says nothing of what is remembered beyond it.
             self._held = begun - first > context + _FURTHER_PAIRS
         return {**streamed, **batched}
 
-    def _stream(self, rig: SensorRig, sequence: StoredSequence, first: int, last: int) -> dict[int, RelativePose]:
+    def _stream(
+        self, rig: SensorRig, sequence: StoredSequence, first: int, last: int, progress: Callable[[int], None]
+    ) -> dict[int, RelativePose]:
         if last == first:
             return {}
         for part in (self._frontend, self._vo):
@@ -106,9 +116,12 @@ class LearnedAnswers:
             if previous is not None:
                 answers[number - 1] = self._vo.estimate(previous, current)
             previous = current
+            progress(len(answers))
         return answers
 
-    def _batch(self, sequence: StoredSequence, first: int, last: int, context: int) -> dict[int, RelativePose]:
+    def _batch(
+        self, sequence: StoredSequence, first: int, last: int, context: int, progress: Callable[[int], None]
+    ) -> dict[int, RelativePose]:
         pairs = min(context + _FURTHER_PAIRS, last - first)
         index = WindowIndex([_cut(sequence, first, last)], pairs, split="answers").tiled(pairs - context + 1)
         answers: dict[int, RelativePose] = {}
@@ -129,7 +142,12 @@ class LearnedAnswers:
                 place = first + window.start + pairs - len(T_prev_cur)
                 for offset, (T, stated) in enumerate(zip(T_prev_cur, covariance, strict=True)):
                     answers.setdefault(place + offset, _pose(T, stated))
+            progress(len(answers))
         return answers
+
+
+def _tell(progress: Callable[[int], None], before: int, further: int) -> None:
+    progress(before + further)
 
 
 def _runs(sequence: StoredSequence) -> list[tuple[int, int]]:

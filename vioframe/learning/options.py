@@ -33,6 +33,7 @@ class TrainerOptions:
         size_px: (width, height) to which images are resized; the parts take it from here.
         flow_size_px, width, dropout: of nets; only recorded here, the parts take them from here.
         channels: 1 (grey) or 3 (RGB).
+        recordings: learned from, the first so many of ``training_data``; None takes them all.
         cache: folder of the decoded recordings.
         train: slots whose parts are trained, the others keep their weights; None trains all that can be.
         optimizer, learning_rate, weight_decay: of the steps; ``adamw`` spares biases and scales from the decay.
@@ -67,6 +68,7 @@ class TrainerOptions:
     width: float
     dropout: float
     channels: int
+    recordings: int | None
     cache: str
     train: Sequence[str] | None
     optimizer: Literal["adam", "adamw"]
@@ -95,7 +97,10 @@ class TrainerOptions:
             if str(getattr(self, name)) not in allowed:
                 raise ConfigError(f"trainer.{name} must be one of {', '.join(allowed)}, got {getattr(self, name)!r}")
         counts = ("max_epochs", "batch_size", "halve_every", "top_k", "validate_every", "segment_step", "devices")
-        for name in (*counts, *(each for each in ("epoch_windows", "pairs") if getattr(self, each) is not None)):
+        for name in (
+            *counts,
+            *(each for each in ("epoch_windows", "pairs", "recordings") if getattr(self, each) is not None),
+        ):
             value = getattr(self, name)
             if not isinstance(value, int) or value < 1:
                 raise ConfigError(f"trainer.{name} must be a whole number of 1 or more, got {value!r}")

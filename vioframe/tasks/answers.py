@@ -32,17 +32,14 @@ from vioframe.interfaces import (
     Component,
     Frontend,
     Fuser,
-    InertialIntegrator,
-    Synchronizer,
     Trainable,
     UsesGroundTruth,
     VOEstimator,
 )
-from vioframe.pipeline import Pipeline
-from vioframe.tasks.bearing import bearing_of
-from vioframe.tasks.decoding import DecodingJob, decoding_jobs, read_splits, splits_of
+from vioframe.pipeline import SLOTS, Pipeline
+from vioframe.tasks.bearing import bearing, bearing_of
+from vioframe.tasks.decoding import DecodingJob, decode, decoding_jobs, read_splits, splits_of
 from vioframe.tasks.pool import in_processes, telling
-from vioframe.tasks.progress import share_progress
 from vioframe.tasks.run_sequence import lend_ground_truth
 from vioframe.types import Frame, ImuNoise, Measurement, NavState, Packet, RelativePose, SensorRig, VisualFeatures
 
@@ -79,7 +76,7 @@ def read_answered_splits(
         return read_splits(config, options, choices, shown=shown, images=False)
     store = _Store(Path(options.cache).expanduser() / "answers", choices.get("vo", "vo"))
     if isinstance(vo, Trainable):
-        return _ask_net(config, pipeline, options, choices, store, shown=shown)
+        return _ask_net(config, options, choices, store, shown=shown)
     if pipeline.frontend is None and not vo.requires:
         return _ask_drawing(config, options, choices, store, shown=shown)
     jobs = decoding_jobs(config, options, choices, images=False)
@@ -106,6 +103,17 @@ class _StreamJob:
     store: "_Store"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _NetJob:
+    """One stored recording to ask a VO with a net for, as it travels to another process."""
+
+    stored: Path
+    parts: Mapping[str, Any]
+    choices: Mapping[str, str]
+    batch_size: int
+    path: Path
+
+
 @dataclass(frozen=True, slots=True)
 class _Store:
     """Where answers are kept: a folder, and what the VO is called."""
@@ -120,36 +128,47 @@ class _Store:
 
 
 def _ask_net(
-    config: DictConfig,
-    pipeline: Pipeline,
-    options: "TrainerOptions",
-    choices: Mapping[str, str],
-    store: _Store,
-    *,
-    shown: bool,
+    config: DictConfig, options: "TrainerOptions", choices: Mapping[str, str], store: _Store, *, shown: bool
 ) -> "tuple[Split, Split]":
+    from vioframe.learning.training import has_gpu
+
+    jobs = decoding_jobs(config, options, choices, images=True)
+    folders = decode(jobs, shown=shown)
+    splits = splits_of(jobs, folders)
+    parts = {slot: OmegaConf.to_container(config[slot], resolve=True) for slot in _ASKED if config.get(slot)}
+    words = {slot: bearing(node) for slot, node in parts.items()}
+    named = {slot: choices.get(slot, "") for slot in parts}
+    sequences = [sequence for split in splits for sequence in split.sequences]
+    contents = [content for split in splits for content in split.hashes]
+    paths = [store.path(one.name, content, words) for one, content in zip(sequences, contents, strict=True)]
+    missing = [
+        _NetJob(stored=folder, parts=parts, choices=named, batch_size=options.batch_size, path=path)
+        for folder, path in zip(folders, paths, strict=True)
+        if not path.is_file()
+    ]
+    title = f"asking vo={choices.get('vo', '')} for {len(missing)} recordings"
+    # Processes would only get in each other's way on one GPU.
+    in_processes(_ask, missing, title=title, shown=shown, most=1 if has_gpu() else None)
+    answers = iter([read_answers(path) for path in paths])
+    return _answered(splits[0], answers), _answered(splits[1], answers)
+
+
+def _ask(job: _NetJob) -> None:
+    """In a process of the pool: ask the VO for one recording."""
+    import torch
+
     from vioframe.learning.answers import LearnedAnswers
 
-    splits = read_splits(config, options, choices, shown=shown)
-    parts = {slot: bearing_of(config, slot) for slot in _ASKED if config.get(slot)}
-    wanted = [
-        (sequence, store.path(sequence.name, content, parts))
-        for split in splits
-        for sequence, content in zip(split.sequences, split.hashes, strict=True)
-    ]
-    missing = [(sequence, path) for sequence, path in wanted if not path.is_file()]
-    if missing and pipeline.vo is not None:
-        asked = LearnedAnswers(pipeline.frontend, pipeline.vo, options.batch_size)
-        title = f"asking vo={choices.get('vo', '')} for {len(missing)} recordings"
-        with share_progress(title, sum(len(sequence) - 1 for sequence, _ in missing), shown=shown) as advance:
-            done = 0
-            for sequence, path in missing:
-                write_answers(path, asked.answer(sequence))
-                done += len(sequence) - 1
-                advance(done)
-    answers = iter([read_answers(path) for _, path in wanted])
-    train, validation = splits
-    return _answered(train, answers), _answered(validation, answers)
+    if torch.get_num_threads() > 1:
+        # As many processes as cores have been started.
+        torch.set_num_threads(1)
+    frontend, vo = (_part(job.parts, job.choices, slot) for slot in _ASKED)
+    if not isinstance(vo, VOEstimator) or not (frontend is None or isinstance(frontend, Frontend)):
+        raise ConfigError(f"vo={job.choices.get('vo', '')} cannot be asked for motions")
+    sequence, _ = read_stored(job.stored)
+    advance = telling(len(sequence))
+    write_answers(job.path, LearnedAnswers(frontend, vo, job.batch_size).answer(sequence, advance))
+    advance(len(sequence))
 
 
 def _ask_drawing(
@@ -249,17 +268,15 @@ def _push(pipeline: Pipeline, packet: Packet) -> None:
 
 
 def _listening(job: _StreamJob, listener: _Listener) -> Pipeline:
-    config = OmegaConf.create({slot: dict(node) for slot, node in job.parts.items()})
-    interfaces: dict[str, type[Component]] = {
-        "synchronizer": Synchronizer,
-        "frontend": Frontend,
-        "vo": VOEstimator,
-        "integrator": InertialIntegrator,
-    }
-    parts: dict[str, Any] = {
-        slot: build(config, slot, interfaces[slot], job.choices.get(slot, "")) for slot in job.parts
-    }
+    parts: dict[str, Any] = {slot: _part(job.parts, job.choices, slot) for slot in job.parts}
     return Pipeline(**parts, fuser=listener, choices=job.choices)
+
+
+def _part(parts: Mapping[str, Any], choices: Mapping[str, str], slot: str) -> Component | None:
+    """The part of one slot, or None where it is empty."""
+    if slot not in parts:
+        return None
+    return build(OmegaConf.create({slot: dict(parts[slot])}), slot, SLOTS[slot], choices.get(slot, ""))
 
 
 def _answered(split: "Split", answers: Iterator[PairAnswers]) -> "Split":

@@ -1,6 +1,6 @@
 """The recordings of a training, decoded into the cache by as many processes as there are cores."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -68,8 +68,16 @@ def read_splits(
         DataError: a recording that cannot be read or stored.
     """
     jobs = decoding_jobs(config, options, choices, images=images)
-    folders = in_processes(_store, jobs, title=f"reading {len(jobs)} recordings", shown=shown)
-    return splits_of(jobs, folders)
+    return splits_of(jobs, decode(jobs, shown=shown))
+
+
+def decode(jobs: Sequence[DecodingJob], *, shown: bool) -> list[Path]:
+    """Folders of the stored recordings, which are decoded now if they were not before.
+
+    Raises:
+        DataError: a recording that cannot be read or stored.
+    """
+    return in_processes(_store, jobs, title=f"reading {len(jobs)} recordings", shown=shown)
 
 
 def decoding_jobs(
@@ -90,11 +98,11 @@ def decoding_jobs(
     return [
         DecodingJob(data=data, split=split, choice=choice, name=name, source=_source(data, split), cache=cache)
         for split, dataset in datasets.items()
-        for name in dataset.sequences
+        for name in dataset.sequences[: options.recordings if split == "train" else None]
     ]
 
 
-def splits_of(jobs: list[DecodingJob], folders: list[Path]) -> "tuple[Split, Split]":
+def splits_of(jobs: Sequence[DecodingJob], folders: Sequence[Path]) -> "tuple[Split, Split]":
     """Training and validation from where the jobs' recordings are kept.
 
     Raises:

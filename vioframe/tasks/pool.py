@@ -21,7 +21,9 @@ Result = TypeVar("Result")
 _done: "Synchronized[float] | None" = None
 
 
-def in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], *, title: str, shown: bool) -> list[Result]:
+def in_processes(
+    work: Callable[[Job], Result], jobs: Sequence[Job], *, title: str, shown: bool, most: int | None = None
+) -> list[Result]:
     """Do each job in a process of a pool; the results in the order of the jobs.
 
     Args:
@@ -29,6 +31,7 @@ def in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], *, title: s
         jobs: as they travel to other processes.
         title: of the progress bar.
         shown: whether there is one.
+        most: processes; None: as many as there are cores.
 
     Raises:
         DataError: a process was ended from outside.
@@ -41,7 +44,7 @@ def in_processes(work: Callable[[Job], Result], jobs: Sequence[Job], *, title: s
     done = context.Value("d", 0.0)
     with (
         share_progress(title, len(jobs), shown=shown) as advance,
-        _pool(min(cores, len(jobs)), context, done) as pool,
+        _pool(min(most or cores, len(jobs)), context, done) as pool,
     ):
         futures: list[Future[Result]] = [pool.submit(_guarded, work, job) for job in jobs]
         waiting = set(futures)
