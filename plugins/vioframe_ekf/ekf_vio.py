@@ -33,7 +33,7 @@ class ImuTrust:
         gyro_walk: rad/s²/√Hz, of its bias.
         accel_noise: m/s²/√Hz.
         accel_walk: m/s³/√Hz, of its bias.
-        learn: learn factors on the four.
+        learn: learn factors on the four, and on the sigmas of both biases that ``start`` states.
         gravity_sigma: m/s², of the size of gravity.
         gap_allowed_s: a longer hole between samples widens the covariance.
         gap_rate_sigma: rad/s, unknown rate inside such a hole.
@@ -83,7 +83,8 @@ class LearningOptions:
         relative, absolute, likelihood: weights of the terms of the loss; see the README.
         relative_rotation: κ1, m²/rad².
         absolute_rotation: κ2, m².
-        draw_start: begin training windows with a state that is wrong by a draw from its covariance.
+        draw_start: begin training windows with pose, velocity and gravity that are wrong by a draw from their
+            covariance.
     """
 
     learns_from: Literal["answers", "images"] = "answers"
@@ -142,6 +143,7 @@ class EkfVioFuser(RelativePoseFuser):
         self._trust = inertial or ImuTrust()
         super().__init__(visual=visual, inertial=self._trust.options(), standstill=standstill, start=start)
         self._learning = learning or LearningOptions()
+        self._stated_start = self._start
         self._untrained = weights is None
         self._holder = NetHolder(self, "fuser", "ekf_vio", self._make, weights, "cpu", works_untrained=True)
 
@@ -179,6 +181,8 @@ class EkfVioFuser(RelativePoseFuser):
             "accel_noise": accel,
             "gyro_walk": gyro_walk,
             "accel_walk": accel_walk,
+            "gyro_bias_sigma": self._stated_start.gyro_bias_sigma,
+            "accel_bias_sigma": self._stated_start.accel_bias_sigma,
             "covariance_scale": visual.covariance_scale,
             "rotation_sigma": visual.rotation_sigma,
             "translation_sigma": visual.translation_sigma,
@@ -210,7 +214,7 @@ class EkfVioFuser(RelativePoseFuser):
             upstream,
             visual=self._visual,
             gate=self._gate,
-            start=self._start,
+            start=self._stated_start,
             trust=self._inertial,
             gravity_sigma=self._trust.gravity_sigma,
             draw_start=self._learning.draw_start and self.net.training,
@@ -239,6 +243,8 @@ class EkfVioFuser(RelativePoseFuser):
             DataError: the file of weights cannot be used.
         """
         self._holder.prepare()
+        gyro, accel = self._learned().bias_sigmas().tolist()
+        self._start = replace(self._stated_start, gyro_bias_sigma=gyro, accel_bias_sigma=accel)
         self._integrated_at = ImuBias()
         super().setup(rig)
 
@@ -314,6 +320,7 @@ class EkfVioFuser(RelativePoseFuser):
 
         return FilterNoise(
             densities=self._trust.densities,
+            bias_sigmas=(self._stated_start.gyro_bias_sigma, self._stated_start.accel_bias_sigma),
             decades=self._learning.decades,
             slope=self._learning.slope,
             learn_inertial=self._trust.learn,

@@ -33,15 +33,20 @@ from vioframe_ekf.net.robocentric import (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StartSigmas:
-    """Of a state that is given; see :class:`vioframe.fusion_options.StartOptions`, and ``gravity`` m/s² of its size."""
+    """Of a state that is given: :class:`vioframe.fusion_options.StartOptions`, with two of biases that may be learned.
+
+    Attributes:
+        tilt, yaw, position, velocity: as there.
+        gravity: m/s², of its size.
+        biases: (2,) rad/s of the gyro and m/s² of the accelerometer.
+    """
 
     tilt: float
     yaw: float
     position: float
     velocity: float
-    gyro_bias: float
-    accel_bias: float
     gravity: float
+    biases: Tensor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,9 +124,9 @@ def state_of(R: Tensor, p: Tensor, v: Tensor, gravity: Tensor, bias: Tensor, nav
         size_sigma: of the magnitude of gravity, m/s².
     """
     into = from_nav_errors(R, p, v, gravity)
-    covariance = into @ nav @ into.transpose(-1, -2)
-    along = gravity / gravity.norm(dim=-1, keepdim=True) * size_sigma
-    covariance[:, GRAVITY, GRAVITY] += along[:, :, None] * along[:, None, :]
+    along = gravity.new_zeros(len(gravity), AT_IMAGE)
+    along[:, GRAVITY] = gravity / gravity.norm(dim=-1, keepdim=True) * size_sigma
+    covariance = into @ nav @ into.transpose(-1, -2) + along[:, :, None] * along[:, None, :]
     return State(
         R=R, p=p, gravity=gravity, v=v, bias=bias, covariance=0.5 * (covariance + covariance.transpose(-1, -2))
     )
@@ -134,9 +139,9 @@ def given_state(v: Tensor, gravity: Tensor, sigmas: StartSigmas) -> State:
     up = R[:, 2]
     nav = R.new_zeros(B, 15, 15)
     nav[:, 0:3, 0:3] = sigmas.tilt**2 * eye + (sigmas.yaw**2 - sigmas.tilt**2) * up[:, :, None] * up[:, None, :]
-    rest = (sigmas.position, sigmas.velocity, sigmas.gyro_bias, sigmas.accel_bias)
-    for block, sigma in enumerate(rest, start=1):
-        nav[:, 3 * block : 3 * block + 3, 3 * block : 3 * block + 3] = sigma**2 * eye
+    nav[:, 3:6, 3:6], nav[:, 6:9, 6:9] = sigmas.position**2 * eye, sigmas.velocity**2 * eye
+    nav[:, 9:12, 9:12] = sigmas.biases[0].square() * eye
+    nav[:, 12:15, 12:15] = sigmas.biases[1].square() * eye
     return state_of(R, torch.zeros_like(v), v, gravity, v.new_zeros(B, 6), nav, sigmas.gravity)
 
 
@@ -145,28 +150,26 @@ def _levels(gravity: Tensor) -> Array:
     return np.stack([level(-each) for each in gravity.detach().cpu().numpy()])
 
 
-def misplaced(state: State, draw: Tensor) -> tuple[State, Tensor]:
-    """A state that is wrong by a draw from its own covariance, as one in use is.
+def misplaced(state: State, draw: Tensor) -> State:
+    """A state whose pose, velocity and gravity are wrong by a draw from their covariance, as they are in use.
+
+    The biases stay: what they are in the recordings is what their sigmas are learned from.
 
     Args:
         state: the truth, with the covariance that the filter starts with.
-        draw: (B, 18) standard normal.
-
-    Returns:
-        what the filter is to start from, and what the samples must be spoilt by (B, 6), since its bias stays.
+        draw: (B, 12) standard normal.
     """
     # Gravity and tilt err together, so the covariance has no Cholesky factor.
-    values, vectors = torch.linalg.eigh(state.covariance)
+    values, vectors = torch.linalg.eigh(state.covariance[:, :12, :12].detach())
     error = apply(vectors, values.clamp_min(0.0).sqrt() * draw)
     turned = turn(-error[:, 0:3])
-    wrong = replace(
+    return replace(
         state,
         R=turned @ state.R,
         p=apply(turned, state.p - error[:, 3:6]),
         gravity=state.gravity - error[:, GRAVITY],
         v=state.v - error[:, VELOCITY],
     )
-    return wrong, error[:, BIAS]
 
 
 def follow(

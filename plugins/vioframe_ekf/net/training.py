@@ -59,9 +59,8 @@ def run_filter(
         yaw=start.yaw_sigma,
         position=start.position_sigma,
         velocity=start.velocity_sigma,
-        gyro_bias=start.gyro_bias_sigma,
-        accel_bias=start.accel_bias_sigma,
         gravity=gravity_sigma,
+        biases=net.bias_sigmas(),
     )
     first = given_state(v, gravity, sigmas)
     camera_truth = batch.T_prev_cur[:, -pairs:].double()
@@ -69,11 +68,9 @@ def run_filter(
     T_first = torch.eye(4, dtype=first.R.dtype, device=first.R.device).repeat(len(v), 1, 1)
     T_first[:, :3, :3] = first.R
     truth = T_first[:, None] @ body_truth
-    imu = batch.imu[:, -pairs:].double()
     if draw_start:
-        first, bias = misplaced(first, torch.randn(first.covariance.shape[:2], dtype=v.dtype, device=v.device))
-        imu = imu + bias[:, None, None, :]
-    samples = preintegrate(imu, batch.imu_time_s[:, -pairs:], batch.imu_mask[:, -pairs:])
+        first = misplaced(first, torch.randn(len(v), 12, dtype=v.dtype, device=v.device))
+    samples = preintegrate(batch.imu[:, -pairs:], batch.imu_time_s[:, -pairs:], batch.imu_mask[:, -pairs:])
     path = follow(
         first,
         samples,

@@ -40,7 +40,9 @@ from vioframe_ekf.net.robocentric import (
 )
 from vioframe_preintegration import Preintegration
 
-SIGMAS = StartSigmas(tilt=0.01, yaw=0.02, position=0.1, velocity=0.2, gyro_bias=0.01, accel_bias=0.1, gravity=0.05)
+SIGMAS = StartSigmas(
+    tilt=0.01, yaw=0.02, position=0.1, velocity=0.2, gravity=0.05, biases=torch.tensor([0.01, 0.1]).double()
+)
 
 
 @pytest.fixture
@@ -278,12 +280,11 @@ def test_holes_widen_as_in_the_core():
 def test_a_draw_is_an_error_of_the_covariance_it_came_from(random):
     state = some_state(random, 2000)
     one = State(**{name: getattr(state, name)[:1].expand_as(getattr(state, name)) for name in State.__slots__})
-    wrong, bias = misplaced(one, normal(random, 2000, 18))
-    error = torch.cat([error_between(wrong, one)[:, :12], bias], dim=-1)
-    spread = one.covariance[0].diagonal().sqrt()
+    error = error_between(misplaced(one, normal(random, 2000, 12)), one)[:, :12]
+    stated = one.covariance[0, :12, :12]
+    spread = stated.diagonal().sqrt()
     assert torch.allclose(error.std(0), spread, rtol=0.1)
-    shared = error.T.cov() / spread.outer(spread)
-    assert torch.allclose(shared, one.covariance[0] / spread.outer(spread), atol=0.1)
+    assert torch.allclose(error.T.cov() / spread.outer(spread), stated / spread.outer(spread), atol=0.1)
 
 
 def test_errors_of_a_state_come_back(random):
@@ -304,7 +305,7 @@ def test_gradients_pass_through_the_filter(random):
         motion[:, :3, 3] = moved.r + 0.02 * normal(random, 1, 3)
         motions.append(motion)
         expected = settle(moved)
-    net = FilterNoise(densities=(1e-3, 1e-2, 1e-5, 1e-3))
+    net = FilterNoise(densities=(1e-3, 1e-2, 1e-5, 1e-3), bias_sigmas=(0.01, 0.1))
 
     def end(vector, log_variances, visual, inertial):
         densities, factors = densities_of(inertial), net.factors(visual)
