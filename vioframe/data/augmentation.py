@@ -11,7 +11,8 @@ Geometric ones change motion, inertial samples and calibration with the images, 
   one, -B ω; an error (φ, ρ) of a VO's motion becomes (-M φ, M ρ).
 
 The others change pixels only: Gaussian blur and salt and pepper as in Zhao et al. 2022, and brightness, contrast and
-gamma, which a window shares, since a camera's exposure changes slowly.
+gamma, which a window shares, since a camera's exposure changes slowly. What is done to stamps and inertial samples is
+in :mod:`vioframe.data.desync`.
 """
 
 from collections.abc import Sequence
@@ -21,6 +22,7 @@ import cv2
 import numpy as np
 
 from vioframe.checks import Array, check_not_negative
+from vioframe.data.desync import Desynchronisation
 from vioframe.data.windows import PairAnswers, TrainingWindow
 from vioframe.errors import ConfigError
 from vioframe.geometry import se3
@@ -43,6 +45,10 @@ class Augmentation:
         brightness: most relative change of brightness.
         contrast: most relative change of contrast about the mean.
         gamma: most change of the logarithm of gamma.
+        sensors: how far sensors are out of step, or None; takes effect where windows are cut, before all others.
+
+    Attributes:
+        sensors: the same.
 
     Raises:
         ConfigError: a probability outside [0, 1], a negative size.
@@ -61,6 +67,7 @@ class Augmentation:
         brightness: float,
         contrast: float,
         gamma: float,
+        sensors: Desynchronisation | None = None,
     ) -> None:
         chances = {
             "reverse": reverse,
@@ -89,6 +96,7 @@ class Augmentation:
         self._brightness = brightness
         self._contrast = contrast
         self._gamma = gamma
+        self.sensors = sensors or Desynchronisation()
 
     def settings(self) -> dict[str, object]:
         """The options as plain values, for the record."""
@@ -103,6 +111,7 @@ class Augmentation:
             "brightness": self._brightness,
             "contrast": self._contrast,
             "gamma": self._gamma,
+            "sensors": self.sensors.settings(),
         }
 
     def apply(self, window: TrainingWindow, rng: np.random.Generator) -> TrainingWindow:

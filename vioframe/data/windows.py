@@ -256,8 +256,13 @@ class WindowIndex:
         return len(self._start)
 
     def __getitem__(self, index: int) -> TrainingWindow:
+        sequence, start, recording = self.place(index)
+        return cut_window(sequence, start, self.pairs, recording)
+
+    def place(self, index: int) -> tuple[StoredSequence, int, int]:
+        """Where a window is: recording, number of its first image, number of the recording."""
         recording = int(self._recording[index])
-        return cut_window(self.sequences[recording], int(self._start[index]), self.pairs, recording)
+        return self.sequences[recording], int(self._start[index]), recording
 
     @property
     def shortest_run(self) -> int:

@@ -41,9 +41,16 @@ class WindowDataset(Dataset[TrainingWindow]):
 
     def __getitem__(self, key: Key) -> TrainingWindow:
         epoch, number = key
-        window = self._index[number]
         if self._augmentation is None:
-            return window
+            return self._index[number]
+        window = None
+        if self._augmentation.sensors.active:
+            sequence, start, recording = self._index.place(number)
+            # Drawn apart, so that the other changes stay what they are without it.
+            rng = np.random.default_rng([self._seed, epoch, number, 1])
+            window = self._augmentation.sensors.cut(sequence, start, self._index.pairs, recording, rng)
+        if window is None:
+            window = self._index[number]
         return self._augmentation.apply(window, np.random.default_rng([self._seed, epoch, number]))
 
 
