@@ -20,7 +20,7 @@ from vioframe.data.vo_errors import DIRECTION, ROTATION, SCALE, VoErrors, error_
 from vioframe.errors import DataError
 
 # Below this speed, m/s, direction and scale of a motion are mostly noise.
-_LEAST_SPEED = 1.0
+_LEAST_SPEED = 3.0
 _LEAST_PAIRS = 200
 # Lags are looked at up to this many seconds; what lasts longer than the longest time is as good as constant.
 _LONGEST_LAG_S = 10.0
