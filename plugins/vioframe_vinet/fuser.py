@@ -48,6 +48,7 @@ class VinetFuser(Fuser):
         axes: in which samples and motions are expressed: ``camera``, so that another mounting needs no training, or
             ``body``, for which no calibration of it is needed.
         rotation: the net's is added to the ``gyro``'s, or ``learned`` whole.
+        gyro_memory: what is added to the gyro's is the mean over so many pairs, at most: its bias changes slowly.
         feedback: the core sees its own ``pose`` since it began to remember, or ``none``.
         rotation_unit_rad: what an output of 1 means.
         translation_unit_m: likewise.
@@ -85,6 +86,7 @@ class VinetFuser(Fuser):
         dropout: float = 0.1,
         axes: Axes = "camera",
         rotation: Rotation = "gyro",
+        gyro_memory: int = 300,
         feedback: Feedback = "none",
         rotation_unit_rad: float = 0.005,
         translation_unit_m: float = 1.0,
@@ -114,6 +116,7 @@ class VinetFuser(Fuser):
             dropout=dropout,
             axes=axes,
             rotation=rotation,
+            gyro_memory=gyro_memory,
             feedback=feedback,
             rotation_unit_rad=rotation_unit_rad,
             translation_unit_m=translation_unit_m,
@@ -208,7 +211,7 @@ class VinetFuser(Fuser):
         elif self._chain.stamp_ns != window.previous.stamp_ns:
             # What it remembers is of another time.
             self._counts["missing windows"] += 1
-            self._state = None
+            self._state = None if self._state is None else self._state.rested()
             self._chain.coast(window.previous.stamp_ns)
         embedding = self._embedding(measurement)
         self._account(window, seen=embedding is not None)
@@ -376,6 +379,7 @@ class VinetFuser(Fuser):
             dropout=options.dropout,
             log_variances=options.log_variances,
             gyro_turns=options.rotation == "gyro",
+            gyro_memory=options.gyro_memory,
             feed_back_pose=options.feedback == "pose",
             rotation_unit_rad=options.rotation_unit_rad,
             translation_unit_m=options.translation_unit_m,

@@ -33,6 +33,7 @@ class NetOptions:
         dropout: in training, after the core and between its layers.
         axes: in which samples and motions are expressed.
         rotation: added to the gyro's, or learned whole.
+        gyro_memory: of so many pairs, at most, the correction of the gyro is the mean.
         feedback: what the core sees of its own answers.
         rotation_unit_rad, translation_unit_m: what an output of 1 means.
         loss: ``learned`` weights, or the ``likelihood`` of a Gaussian with the variances stated.
@@ -55,6 +56,7 @@ class NetOptions:
     dropout: float
     axes: Axes
     rotation: Rotation
+    gyro_memory: int
     feedback: Feedback
     rotation_unit_rad: float
     translation_unit_m: float
@@ -66,8 +68,8 @@ class NetOptions:
     lost_imu: float
 
     def __post_init__(self) -> None:
-        counts = ("embedding", "window", "imu_intervals", "imu_hidden", "imu_layers", "hidden", "layers", "joined")
-        for name in counts:
+        sizes = ("embedding", "window", "imu_intervals", "imu_hidden", "imu_layers", "hidden", "layers", "joined")
+        for name in (*sizes, "gyro_memory"):
             value = getattr(self, name)
             if not isinstance(value, int) or value < 1:
                 raise ConfigError(f"fuser.{name} must be a whole number of 1 or more, got {value!r}")
@@ -100,6 +102,7 @@ class NetOptions:
             "joined": self.joined,
             "axes": self.axes,
             "rotation": self.rotation,
+            "gyro_memory": self.gyro_memory,
             "feedback": self.feedback,
             "rotation_unit_rad": self.rotation_unit_rad,
             "translation_unit_m": self.translation_unit_m,
