@@ -90,7 +90,7 @@ class LearningOptions:
     learns_from: Literal["answers", "images"] = "answers"
     window: int = 32
     decades: float = 3.0
-    slope: float = 1.0
+    slope: float = 10.0
     relative: float = 1.0
     absolute: float = 1.0
     likelihood: float = 1.0
