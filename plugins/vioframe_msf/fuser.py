@@ -1,10 +1,12 @@
 """Inertial propagation corrected by relative poses of unknown scale, drifting and late."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
+from vioframe.camera_delay import DelayEstimator, DelayOptions
 from vioframe.checks import Array
 from vioframe.error_state import INERTIAL, VELOCITY
 from vioframe.errors import ConfigError
@@ -12,7 +14,7 @@ from vioframe.fusion_options import InertialOptions, StandstillOptions, StartOpt
 from vioframe.increments import part_of
 from vioframe.interfaces import CONSISTENT_SCALE, INERTIAL_DELTA, RELATIVE_POSE
 from vioframe.loose_fusion import LooseFuser, Step, VisualMotion
-from vioframe.types import InertialDelta, NavState
+from vioframe.types import InertialDelta, Measure, Measurement, NavState, SensorRig
 from vioframe_msf.search import ScaleSearch
 from vioframe_msf.state import ScaledFilter
 
@@ -122,9 +124,10 @@ class MsfFuser(LooseFuser):
         drift: how the VO's error is made up.
         extrinsics: how far the camera's calibrated place may be off.
         delay_s: a relative pose between two stamps tells the motion between the instants this much earlier.
+        camera_delay: whether the constant offset of the camera's clock is estimated too.
 
     Raises:
-        ConfigError: an option outside its range.
+        ConfigError: an option outside its range, or two delays that nothing could tell apart.
     """
 
     requires: ClassVar[frozenset[str]] = frozenset({INERTIAL_DELTA, RELATIVE_POSE, CONSISTENT_SCALE})
@@ -141,6 +144,7 @@ class MsfFuser(LooseFuser):
         drift: DriftOptions | None = None,
         extrinsics: ExtrinsicsOptions | None = None,
         delay_s: float = 0.0,
+        camera_delay: DelayOptions | None = None,
     ) -> None:
         super().__init__(visual=visual, inertial=inertial, standstill=standstill, start=start)
         if not delay_s >= 0.0:
@@ -151,8 +155,36 @@ class MsfFuser(LooseFuser):
         self._scale = scale or ScaleOptions()
         self._drift = drift or DriftOptions()
         self._extrinsics = extrinsics or ExtrinsicsOptions()
+        self._camera_delay = camera_delay or DelayOptions()
+        if delay_s and self._camera_delay.estimate:
+            raise ConfigError(
+                f"fuser.delay_s={delay_s} and fuser.camera_delay.estimate=true: both move the images against the "
+                "inertial samples, and nothing could tell them apart; use one"
+            )
         self._delay_s = delay_s
+        self._offset: DelayEstimator | None = None
         self._gate = self._visual.gate(6)
+
+    def setup(self, rig: SensorRig) -> None:
+        """Forget the last sequence, its delay too, and take the next one's calibration."""
+        super().setup(rig)
+        options, visual = self._camera_delay, self._visual
+        if options.estimate:
+            self._offset = DelayEstimator(options, rig, visual.covariance_scale, visual.rotation_sigma)
+
+    def update(self, measurement: Measurement) -> list[NavState]:
+        """Propagate over the window, then correct; the delay is learned before the filter has a first state."""
+        if self._offset is not None:
+            measurement = self._offset.learn(measurement, self.bias())
+        return super().update(measurement)
+
+    def camera_delay_ns(self) -> int | None:
+        """What the synchronizer should assume next, where the delay is estimated."""
+        return None if self._offset is None else self._offset.assumed_ns()
+
+    def calibration(self) -> Mapping[str, Measure]:
+        """The delay of the camera, where it is estimated, as the change from the rig's."""
+        return {} if self._offset is None else {"camera delay": Measure(value=1e3 * self._offset.change_s, unit="ms")}
 
     @property
     def scale(self) -> float:

@@ -114,6 +114,8 @@ class StudySummary:
         start = self.spread(variant, study.reference, column)
         if not any(cell.variant == variant for cell in self.results):
             return f"{variant}: not run."
+        if (variant, study.reference) not in {(cell.variant, cell.value) for cell in self.results}:
+            return f"{variant}: not run at {at(study.reference)}."
         if start is None:
             return f"{variant}: {name} is undefined at {at(study.reference)}."
         said = [f"{variant}: {name} {told(start)} at {at(study.reference)}"]
