@@ -6,6 +6,7 @@ from typing import Literal
 
 from vioframe.checks import check_not_negative, check_positive
 from vioframe.errors import ConfigError
+from vioframe.fusion_options import InertialOptions, VisualOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -15,7 +16,8 @@ class ResidualOptions:
     Attributes:
         channels: width of the net.
         dropout: in training.
-        corrects_rotation: the net corrects rotations too, not only their variances.
+        bias_caution: factor on the spread of gyro biases over the training recordings, which is what the filter
+            assumes of the one it begins with; 0 leaves that to ``start``.
         horizons: pairs over which errors are summed up in training.
         speed_unit: m/s that the net takes for one.
         rate_unit: rad/s that it takes for one.
@@ -26,7 +28,7 @@ class ResidualOptions:
 
     channels: int = 48
     dropout: float = 0.1
-    corrects_rotation: bool = False
+    bias_caution: float = 2.0
     horizons: Sequence[int] = (1, 4, 16, 64, 200)
     speed_unit: float = 10.0
     rate_unit: float = 0.3
@@ -42,7 +44,7 @@ class ResidualOptions:
             lost_pairs=self.lost_pairs,
         )
         check_share("fuser.residual.dropout", self.dropout)
-        check_not_negative("fuser.residual", lost_share=self.lost_share)
+        check_not_negative("fuser.residual", lost_share=self.lost_share, bias_caution=self.bias_caution)
         if not self.horizons or not all(isinstance(each, int) and each >= 1 for each in self.horizons):
             raise ConfigError(
                 f"fuser.residual.horizons must be whole numbers of pairs from 1, got {list(self.horizons)}"
@@ -141,6 +143,16 @@ class Unstated:
     translation_sigma: float
     translation_ratio: float
     longest_gap_s: float
+
+
+def unstated_of(visual: VisualOptions, inertial: InertialOptions) -> Unstated:
+    """What the filter's options assume where nothing is stated."""
+    return Unstated(
+        rotation_sigma=visual.rotation_sigma,
+        translation_sigma=visual.translation_sigma,
+        translation_ratio=visual.translation_ratio,
+        longest_gap_s=inertial.gap_allowed_s,
+    )
 
 
 def check_share(key: str, value: float) -> None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from vioframe.checks import Array
+from vioframe.checks import Array, Mask
 from vioframe.conventions import seconds
 from vioframe.errors import ConfigError, StateError
 from vioframe.fusion_options import InertialOptions, VisualOptions
@@ -15,16 +15,17 @@ from vioframe.inertial import level
 from vioframe.interfaces import INERTIAL_DELTA, METRIC_SCALE, RELATIVE_POSE, Fuser
 from vioframe.learning.holder import NetHolder
 from vioframe.types import Measurement, NavState, SensorRig
-from vioframe_lstm.options import PoseOptions
-from vioframe_lstm.streaming import IntervalCheck, pair_of, samples_of, unstated_of
+from vioframe_lstm.options import PoseOptions, unstated_of
+from vioframe_lstm.pairs import Pairs, doubles, joined, pair_of, pairs_of_batch, samples_of
+from vioframe_lstm.stack import Paths, joined_paths, sample_paths, visual_poses
+from vioframe_lstm.warning import IntervalCheck
+from vioframe_lstm.windows import chain_answers, needed_ends, stacks, starts_of, true_poses
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from vioframe.learning.batch import WindowBatch
-    from vioframe_lstm.net.pairs import Pairs
     from vioframe_lstm.net.pose import PoseNet
-    from vioframe_lstm.net.stack import Paths
 
 
 class PoseFuser(Fuser):
@@ -119,7 +120,7 @@ class PoseFuser(Fuser):
         self._past: deque[tuple[Pairs, Paths]] = deque(maxlen=self._frames)
         # At the starts of the window to come and of those after it: states, and where the VO alone is since the first.
         self._states: deque[Array] = deque(maxlen=self._frames)
-        self._visual: deque[Tensor] = deque(maxlen=self._frames)
+        self._visual: deque[Array] = deque(maxlen=self._frames)
         self._T_world_first: Array = np.eye(4)
         self._T_world_body: Array = np.eye(4)
         self._begun = False
@@ -169,67 +170,68 @@ class PoseFuser(Fuser):
         """
         import torch
 
-        from vioframe.learning.motion import inverse, product
-        from vioframe_lstm.net.answers import answer_windows, chain_answers, needed_ends, visual_poses
-        from vioframe_lstm.net.pairs import learn_interval, pairs_of_batch
-        from vioframe_lstm.net.stack import sample_paths
-
         self._holder.taught()
         net, frames = self._pose_net(), self._frames
         pairs = pairs_of_batch(batch, upstream, self._unstated)
         count = len(pairs)
-        imu, time_s, mask = (each[:, -count:] for each in (batch.imu, batch.imu_time_s, batch.imu_mask))
+        imu, time_s = doubles(batch.imu[:, -count:]), doubles(batch.imu_time_s[:, -count:])
+        mask = batch.imu_mask[:, -count:].cpu().numpy()
         paths = sample_paths(imu, time_s, mask, pairs.duration_s, self._poses)
         answered = max(count - frames + 1, 1)
         if net.training:
-            learn_interval(net.interval_s, pairs)
+            if not float(net.interval_s):
+                net.interval_s.fill_(float(np.median(pairs.duration_s)))
             ends = sorted((torch.randperm(count)[: self._options.answers] + 1).tolist())
         else:
             ends = needed_ends(count, answered, frames)
-        first = torch.tensor(ends, device=imu.device) - frames
-        starts = visual_poses(pairs)[:, first.clamp_min(0)] if self._absolute else None
-        answers = answer_windows(net, pairs, paths, ends, frames, starts)
+        T_start = visual_poses(pairs)[:, starts_of(ends, frames)] if self._absolute else None
+        answers = self._ask(stacks(pairs, paths, ends, frames, T_start)).reshape(-1, len(ends), 4, 4)
         told = {"fused_poses": answers, "fused_ends": torch.tensor(ends), "fused_pairs": torch.tensor(count)}
         if net.training:
             return told
-        poses = chain_answers(answers, ends, frames, absolute=self._absolute)
-        row = torch.stack([poses[end] for end in range(count - answered, count + 1)], dim=1)
-        T_body_cam = batch.rig.T_body_cam[:, None]
-        motions = product(inverse(row[:, :-1]), row[:, 1:])
-        return {"T_prev_cur": product(product(inverse(T_body_cam), motions), T_body_cam), **told}
+        poses = chain_answers(doubles(answers), ends, frames, absolute=self._absolute)
+        row = np.stack([poses[end] for end in range(count - answered, count + 1)], axis=1)
+        T_body_cam = doubles(batch.rig.T_body_cam)[:, None]
+        motions = se3.inverse(T_body_cam) @ se3.inverse(row[:, :-1]) @ row[:, 1:] @ T_body_cam
+        return {"T_prev_cur": torch.from_numpy(motions).to(answers), **told}
 
     def loss(self, outputs: "Mapping[str, Tensor]", batch: "WindowBatch") -> "dict[str, Tensor]":
         """``loss``, and mean errors in rad and m."""
-        from vioframe_lstm.net.answers import true_poses
+        import torch
 
-        ends, motions = outputs["fused_ends"].tolist(), batch.T_prev_cur[:, -int(outputs["fused_pairs"]) :]
-        truth = true_poses(motions, batch.rig.T_body_cam, ends, self._frames, absolute=self._absolute)
-        losses: dict[str, Tensor] = self.net.get_submodule("weighing")(outputs["fused_poses"], truth)
+        ends, poses = outputs["fused_ends"].tolist(), outputs["fused_poses"]
+        motions = doubles(batch.T_prev_cur[:, -int(outputs["fused_pairs"]) :])
+        truth = true_poses(motions, doubles(batch.rig.T_body_cam), ends, self._frames, absolute=self._absolute)
+        losses: dict[str, Tensor] = self.net.get_submodule("weighing")(poses, torch.from_numpy(truth).to(poses))
         return losses
+
+    def _ask(self, shown: tuple[Array, Array, Mask]) -> "Tensor":
+        """The net's poses (W, 4, 4) of stacks."""
+        import torch
+
+        R, p, present = shown
+        device = self.net.get_parameter("weighing.log_variance_rotation").device
+        rotation = torch.from_numpy(so3.log(R).astype(np.float32)).to(device)
+        position = torch.from_numpy(p.astype(np.float32)).to(device)
+        answers: Tensor = self._pose_net()(rotation, position, torch.from_numpy(present.copy()).to(device))
+        return answers
 
     def _answer(self, measurement: Measurement) -> Array:
         """T_world_body at the window's end."""
         import torch
 
-        from vioframe_lstm.net.answers import answer_windows, visual_poses
-        from vioframe_lstm.net.pairs import joined
-        from vioframe_lstm.net.stack import joined_paths, sample_paths
-
-        device = self._holder.device()
+        pair = pair_of(measurement, self._T_body_cam, self._unstated)
+        samples, times = samples_of(measurement)
+        path = sample_paths(samples, times, np.ones(times.shape, dtype=np.bool_), pair.duration_s, self._poses)
+        self._past.append((pair, path))
+        pairs, paths = joined([one for one, _ in self._past]), joined_paths([one for _, one in self._past])
+        T_start = self._visual[0][None, None] if self._absolute else None
         with torch.inference_mode():
-            pair = pair_of(measurement, self._T_body_cam, self._unstated, device)
-            samples, times = samples_of(measurement, device)
-            mask = torch.ones_like(times, dtype=torch.bool)
-            path = sample_paths(samples, times, mask, pair.duration_s, self._poses)
-            self._past.append((pair, path))
-            pairs, paths = joined([one for one, _ in self._past]), joined_paths([one for _, one in self._past])
-            starts = self._visual[0][:, None] if self._absolute else None
-            T = answer_windows(self._pose_net(), pairs, paths, [len(pairs)], self._frames, starts)[0, 0]
-            if self._absolute:
-                before, after = visual_poses(pairs)[:, -2:].unbind(1)
-                self._visual.append(self._visual[-1] @ torch.linalg.solve(before, after))
-        T_start = self._T_world_first if self._absolute else self._states[0]
-        T_world_body: Array = T_start @ T.double().cpu().numpy()
+            T = doubles(self._ask(stacks(pairs, paths, [len(pairs)], self._frames, T_start)))[0]
+        if self._absolute:
+            before, after = visual_poses(pairs)[0, -2:]
+            self._visual.append(self._visual[-1] @ se3.inverse(before) @ after)
+        T_world_body: Array = (self._T_world_first if self._absolute else self._states[0]) @ T
         T_world_body[:3, :3] = so3.normalise(T_world_body[:3, :3])
         self._states.append(T_world_body)
         return T_world_body
@@ -250,13 +252,11 @@ class PoseFuser(Fuser):
 
     def _restart(self) -> None:
         """Forget the frames before, and go on from the last pose."""
-        import torch
-
         self._past.clear()
         self._states.clear()
         self._visual.clear()
         self._states.append(self._T_world_body)
-        self._visual.append(torch.eye(4, device=self._holder.device())[None])
+        self._visual.append(np.eye(4))
         self._T_world_first = self._T_world_body
 
     def _state(self, velocity: Array) -> NavState:

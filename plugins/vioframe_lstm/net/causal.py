@@ -1,11 +1,14 @@
-"""A net that answers for every pair from that pair and those before it, no further back than a set number."""
+"""A net that answers for every frame from that frame and those before it, no further back than a set number."""
 
+from collections.abc import Sequence
+
+import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 
 def dilations(frames: int) -> list[int]:
-    """Steps of convolutions of two taps that together look at exactly ``frames`` frames."""
+    """Steps of layers of two taps that together look at exactly ``frames`` frames."""
     steps, left, step = [], frames - 1, 1
     while left > 0:
         steps.append(min(step, left))
@@ -19,15 +22,16 @@ class CausalBlock(nn.Module):
 
     def __init__(self, channels: int, dilation: int, dropout: float) -> None:
         super().__init__()
-        self.past = nn.Conv1d(channels, channels, kernel_size=2, dilation=dilation)
-        self.mixing = nn.Conv1d(channels, channels, kernel_size=1)
+        self.dilation = dilation
+        self.taps = nn.Linear(2 * channels, channels)
+        self.mixing = nn.Linear(channels, channels)
         self.dropout = nn.Dropout(dropout)
-        self._dilation = dilation
 
-    def forward(self, signal: Tensor) -> Tensor:
-        """(B, C, S) to the same shape; nothing precedes the first frame."""
-        seen = functional.silu(self.past(functional.pad(signal, (self._dilation, 0))))
-        mixed: Tensor = signal + self.dropout(self.mixing(seen))
+    def forward(self, signal: Tensor, past: Tensor) -> Tensor:
+        """Of frames (..., C) and those ``dilation`` before them; zero stands for what is before the first."""
+        mixed: Tensor = signal + self.dropout(
+            self.mixing(functional.silu(self.taps(torch.cat([past, signal], dim=-1))))
+        )
         return mixed
 
 
@@ -44,14 +48,59 @@ class CausalNet(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, *, channels: int, frames: int, dropout: float) -> None:
         super().__init__()
-        self.entry = nn.Conv1d(inputs, channels, kernel_size=1)
-        self.blocks = nn.Sequential(*(CausalBlock(channels, step, dropout) for step in dilations(frames)))
-        self.exit = nn.Conv1d(channels, outputs, kernel_size=1)
+        self.entry = nn.Linear(inputs, channels)
+        self._blocks = [CausalBlock(channels, step, dropout) for step in dilations(frames)]
+        self.blocks = nn.ModuleList(self._blocks)
+        self.exit = nn.Linear(channels, outputs)
         nn.init.zeros_(self.exit.weight)
-        if self.exit.bias is not None:
-            nn.init.zeros_(self.exit.bias)
+        nn.init.zeros_(self.exit.bias)
 
-    def forward(self, signal: Tensor) -> Tensor:
+    @property
+    def reaches(self) -> Sequence[int]:
+        """How far each block looks back."""
+        return [block.dilation for block in self._blocks]
+
+    def forward(self, frames: Tensor) -> Tensor:
         """(B, S, inputs) to (B, S, outputs)."""
-        answers: Tensor = self.exit(functional.silu(self.blocks(self.entry(signal.transpose(1, 2)))))
-        return answers.transpose(1, 2)
+        signal = self.entry(frames)
+        for block in self._blocks:
+            past = functional.pad(signal, (0, 0, block.dilation, 0))[:, : signal.shape[1]]
+            signal = block(signal, past)
+        answers: Tensor = self.exit(functional.silu(signal))
+        return answers
+
+    def step(self, frame: Tensor, memory: "Memory") -> Tensor:
+        """The answer (outputs,) to one more frame (inputs,), as :meth:`forward` would give it at the end of the row."""
+        signal = self.entry(frame)
+        for block, line in zip(self._blocks, memory.lines, strict=True):
+            past = line.push(signal)
+            signal = block(signal, past)
+        answer: Tensor = self.exit(functional.silu(signal))
+        return answer
+
+
+class Memory:
+    """What each block of a net has seen of a stream; bounded.
+
+    Args:
+        net: whose blocks they are.
+    """
+
+    def __init__(self, net: CausalNet) -> None:
+        blank = torch.zeros_like(net.exit.weight[0])
+        self.lines = [DelayLine(reach, blank) for reach in net.reaches]
+
+
+class DelayLine:
+    """Gives back what came ``reach`` frames ago, at first a blank."""
+
+    def __init__(self, reach: int, blank: Tensor) -> None:
+        self._kept = [blank] * reach
+        self._next = 0
+
+    def push(self, signal: Tensor) -> Tensor:
+        """Take one more frame."""
+        past = self._kept[self._next]
+        self._kept[self._next] = signal
+        self._next = (self._next + 1) % len(self._kept)
+        return past

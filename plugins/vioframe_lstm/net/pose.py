@@ -44,11 +44,12 @@ class PoseNet(nn.Module):
         interval_s: from image to image in the training recordings, s; zero before any.
     """
 
+    interval_s: Tensor
+
     def __init__(self, options: PoseOptions, poses: int) -> None:
         super().__init__()
         self._units = (options.rotation_unit, options.translation_unit)
-        self.interval_s: Tensor
-        self.register_buffer("interval_s", torch.zeros(()))
+        self.register_buffer("interval_s", torch.zeros((), dtype=torch.float64))
         self.attitude = Branch(3 * (poses + 1), options)
         self.position = Branch(3 * (poses + 1), options)
         hidden, width = options.scaled(options.hidden), 2 * options.scaled(options.channels)
@@ -58,11 +59,11 @@ class PoseNet(nn.Module):
         self.neck = nn.Linear(hidden, options.scaled(options.head))
         self.exit = nn.Linear(options.scaled(options.head), 6)
 
-    def forward(self, R: Tensor, p: Tensor, present: Tensor) -> Tensor:
-        """Poses (W, 4, 4) of stacks R (W, M, N + 1, 3, 3), p (W, M, N + 1, 3) m, and present (W, M) bool."""
+    def forward(self, rotation: Tensor, p: Tensor, present: Tensor) -> Tensor:
+        """Poses (W, 4, 4) of stacks (W, M, N + 1, 3) of rotation vectors and positions, and present (W, M) bool."""
         rotation_unit, translation_unit = self._units
         mask = present[:, None].to(p.dtype)
-        attitude = (log_so3(R) / rotation_unit).flatten(2).transpose(1, 2) * mask
+        attitude = (rotation / rotation_unit).flatten(2).transpose(1, 2) * mask
         position = (p / translation_unit).flatten(2).transpose(1, 2) * mask
         joint = torch.cat([self.attitude(attitude, mask), self.position(position, mask)], dim=1).transpose(1, 2)
         remembered = self.dropout(self.second(self.dropout(self.first(joint))))
