@@ -31,6 +31,7 @@ class Study:
         axis: what the option is, with its unit, as it stands below the curves.
         factor: values times this are shown.
         base: overrides of all variants, such as ``dataset=simulated_car``; what the command line says comes after.
+        more: further overrides of all variants: the command line cannot name options that only they have.
         variants: overrides by the name of the variant; these come last.
         chosen: names of the variants that are run; None for all.
         seeds: each cell is run with each.
@@ -57,6 +58,7 @@ class Study:
         axis: str,
         factor: float,
         base: Sequence[str],
+        more: Sequence[str],
         variants: Mapping[str, Sequence[str]],
         chosen: Sequence[str] | None,
         seeds: Sequence[int],
@@ -74,6 +76,7 @@ class Study:
         self.reference = _numbers("reference", [reference])[0]
         self.factor = _numbers("factor", [factor])[0]
         self.base = [str(text) for text in base]
+        self.more = [str(text) for text in more]
         self.variants = {name: [str(text) for text in texts] for name, texts in _named(variants).items()}
         names = list(self.variants) if chosen is None else [str(name) for name in chosen]
         unknown = [name for name in names if name not in self.variants]

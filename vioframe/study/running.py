@@ -21,6 +21,9 @@ log = logging.getLogger(__name__)
 class StudyRun:
     """The cells of a study and how they are run.
 
+    Attributes:
+        told: what went wrong while it was prepared, and has been said.
+
     Args:
         study: what is to be run.
         given: overrides of the command line, which come after ``study.base`` and before those of a variant.
@@ -36,6 +39,7 @@ class StudyRun:
         self._store = CellStore(Path(study.cells_folder).expanduser())
         self._composed: dict[str, Composed] = {}
         self._weights: dict[tuple[str, int | None], dict[str, str]] = {}
+        self.told: set[str] = set()
         self._broken: dict[tuple[str, int | None], VioframeError] = {}
 
     def prepare(self) -> None:
@@ -46,12 +50,15 @@ class StudyRun:
         """
         seeds: list[int | None] = list(self._study.seeds) if self._study.training_seed_keys else [None]
         for variant in self._study.chosen:
-            overrides = [*self._study.base, *self._given, *self._study.variants[variant]]
+            study = self._study
+            # Of two that set the same, the later counts.
+            overrides = [*study.base, *self._given, *study.variants[variant], *study.more]
             try:
                 composed = self._composer.compose(overrides)
                 self._check(composed.config, variant)
             except VioframeError as error:
-                self._broken.update(dict.fromkeys(((variant, seed) for seed in seeds), error))
+                for seed in seeds:
+                    self._break(variant, seed, error)
                 continue
             self._composed[variant] = composed
             for seed in seeds:
@@ -63,8 +70,7 @@ class StudyRun:
                         Composed(config=config, choices=composed.choices), shown=self._shown
                     )
                 except VioframeError as error:
-                    log.error("%s: %s", variant, error)
-                    self._broken[variant, seed] = error
+                    self._break(variant, seed, error)
 
     def results(self) -> Iterator[tuple[Cell, CellResult]]:
         """Every cell as it ends, those that are there first."""
@@ -118,6 +124,13 @@ class StudyRun:
         set_where_known(config, self._study.seed_keys, cell.seed)
         lend(config, weights)
         return config
+
+    def _break(self, variant: str, seed: int | None, error: VioframeError) -> None:
+        self._broken[variant, seed] = error
+        sentence = failed(error).error
+        if sentence not in self.told:
+            log.error("%s: %s", variant, sentence)
+            self.told.add(sentence)
 
     def _check(self, config: DictConfig, variant: str) -> None:
         value = OmegaConf.select(config, self._study.key)

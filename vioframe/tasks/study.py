@@ -58,7 +58,7 @@ def run(config: DictConfig) -> int:
                 with share_progress(f"study {study.name}", len(study.cells()), shown=shown) as advance:
                     for cell, result in work.results():
                         results[cell] = result
-                        if result.status != "finished":
+                        if result.status != "finished" and result.error not in work.told:
                             log.error("%s: %s", cell, result.error)
                         _record(config, tracker, study, cell, result)
                         advance(len(results))
