@@ -21,7 +21,8 @@ from vioframe.tasks.run_sequence import run_sequence
 
 ROWS = {
     "vo_only": ["fuser=vo_only", "integrator=none"],
-    "imu_only": ["fuser=imu_only", "vo=none"],
+    # The odometry stays, unread: its options are those of a table.
+    "imu_only": ["fuser=imu_only"],
     "ekf": ["fuser=ekf"],
     "msf": ["fuser=msf"],
     "lstm_pose": ["fuser=lstm", "fuser.head=pose"],
