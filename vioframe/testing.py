@@ -29,6 +29,7 @@ from vioframe.interfaces import (
     Fuser,
     InertialIntegrator,
     Synchronizer,
+    Trainable,
     UsesGroundTruth,
     VOEstimator,
 )
@@ -89,8 +90,13 @@ class Scene:
         return packets
 
 
-def make_scene(seed: int = 0) -> Scene:
-    """Build the scene; the same seed gives the same arrays."""
+def make_scene(seed: int = 0, embedding: int = 8) -> Scene:
+    """Build the scene; the same seed gives the same arrays.
+
+    Args:
+        seed: of the dots.
+        embedding: numbers of each frame's embedding, all zero.
+    """
     random = np.random.default_rng(seed)
     rig = _rig()
     imu_stamps = np.arange(0, (FRAMES - 1) * FRAME_STEP_NS + 1, IMU_STEP_NS, dtype=np.int64)
@@ -115,7 +121,9 @@ def make_scene(seed: int = 0) -> Scene:
             scores=np.ones(len(seen)),
         )
         frames.append(frame)
-        features.append(VisualFeatures(frame=frame, tracks=tracks, flow=np.zeros((240, 320, 2)), embedding=np.zeros(8)))
+        features.append(
+            VisualFeatures(frame=frame, tracks=tracks, flow=np.zeros((240, 320, 2)), embedding=np.zeros(embedding))
+        )
     windows = [
         SyncedWindow(
             previous=frames[k],
@@ -126,6 +134,12 @@ def make_scene(seed: int = 0) -> Scene:
         for k in range(FRAMES - 1)
     ]
     return Scene(rig=rig, truth=truth, frames=frames, imu=imu, windows=windows, features=features)
+
+
+def scene_for(component: Component) -> Scene:
+    """The scene with embeddings as long as the component says, under ``embedding`` of its architecture, if it does."""
+    length = component.architecture.get("embedding", 8) if isinstance(component, Trainable) else 8
+    return make_scene(embedding=int(length))
 
 
 def _rig() -> SensorRig:
@@ -197,7 +211,7 @@ def check_component(component: Component) -> None:
             isinstance(names, frozenset) and all(isinstance(each, str) for each in names),
             f"{name}.{what} must be a frozenset of strings, got {names!r}",
         )
-    scene = make_scene()
+    scene = scene_for(component)
     check = _CHECKS[kinds[0]]
     first = _run(component, scene, check)
     again = _run(component, scene, check)

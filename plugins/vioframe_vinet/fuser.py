@@ -384,17 +384,18 @@ class VinetFuser(Fuser):
             rotation_unit_rad=options.rotation_unit_rad,
             translation_unit_m=options.translation_unit_m,
         )
-        weighing: nn.Module
+        means = PoseErrors(
+            log_variance_rotation=options.log_variance_rotation,
+            log_variance_translation=options.log_variance_translation,
+            window=options.window,
+            pose_weight=options.pose_weight,
+        )
+        weighing: nn.Module = means
         if options.loss == "likelihood":
             weighing = PoseLikelihood(
+                means,
                 rotation_unit_rad=options.rotation_unit_rad,
                 translation_unit_m=options.translation_unit_m,
-                pose_weight=options.pose_weight,
-            )
-        else:
-            weighing = PoseErrors(
-                log_variance_rotation=options.log_variance_rotation,
-                log_variance_translation=options.log_variance_translation,
                 pose_weight=options.pose_weight,
             )
         return nn.ModuleDict({"core": core, "weighing": weighing})

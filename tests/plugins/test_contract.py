@@ -10,8 +10,6 @@ from vioframe.testing import check_component
 SMALLER = {
     "tsvo": ("backbone=googlenet", "vo.stack=3", "vo.size_px=[160,96]", "vo.width=0.125"),
     "pair_encoder": ("frontend.size_px=[160,96]", "frontend.width=0.125"),
-    # The scene's embeddings have eight numbers.
-    "vinet": ("fuser.embedding=8", "fuser.hidden=32"),
     "deepvo": ("vo.size_px=[160,96]", "vo.width=0.125", "vo.hidden=32"),
 }
 PARTS = [(slot, name) for slot in SLOTS for name in offered(slot) if name != "none"]

@@ -13,7 +13,7 @@ from vioframe.errors import ConfigError
 from vioframe.interfaces import Component, Frontend, Fuser, InertialIntegrator, Trainable, VOEstimator
 from vioframe.learning import require_torch
 from vioframe.pipeline import SLOTS
-from vioframe.testing import Scene, make_scene, measurement_of
+from vioframe.testing import Scene, make_scene, measurement_of, scene_for
 from vioframe.types import ImuBias
 
 
@@ -77,7 +77,7 @@ def model_card(part: Trainable, choice: str) -> ModelCard:
 
     if not isinstance(part, Component):
         raise ConfigError(f"{choice} is no component")
-    scene = make_scene()
+    scene = scene_for(part)
     part.setup(scene.rig)
     device = next((parameter.device for parameter in part.net.parameters()), torch.device("cpu"))
     calls = _calls(part, scene, choice)

@@ -125,9 +125,6 @@ class VinetCore(nn.Module):
         self._gyro_memory = gyro_memory
         self._units = (rotation_unit_rad, translation_unit_m)
         self.inertial = InertialEncoder(hidden=imu_hidden, layers=imu_layers)
-        # What stands in for a sensor that is missing.
-        self.unseen = nn.Parameter(torch.zeros(embedding))
-        self.unheard = nn.Parameter(torch.zeros(imu_hidden))
         # So many pairs without any correction are as good as what is not known of the bias at first: ln of it.
         self.doubt = nn.Parameter(torch.zeros(())) if gyro_turns else None
         inputs = embedding + imu_hidden + 3 + (_MOTION if feed_back_pose else 0)
@@ -158,9 +155,10 @@ class VinetCore(nn.Module):
         batch, pairs = seen.visible.shape
         state = state or self.begin(batch)
         features = self.inertial(seen.samples.means)
-        features = torch.where(seen.samples.heard[:, None], features, self.unheard.to(features.dtype))
+        # A sensor that is missing shows zeros, and that it is missing: the core's weights of that are what stands in.
+        features = features * seen.samples.heard[:, None]
         heard = seen.samples.heard.reshape(batch, pairs)
-        embedding = torch.where(seen.visible[..., None], seen.embedding, self.unseen.to(seen.embedding.dtype))
+        embedding = torch.where(seen.visible[..., None], seen.embedding, torch.zeros_like(seen.embedding))
         told = [seen.visible.to(embedding.dtype), heard.to(embedding.dtype), seen.duration_s / USUAL_S - 1.0]
         inputs = torch.cat([embedding, features.reshape(batch, pairs, -1), torch.stack(told, dim=-1)], dim=-1)
         gyro = _Gyro(turn_by_gyro(seen.samples).reshape(batch, pairs, 3, 3), heard, heard & seen.visible)

@@ -3,6 +3,8 @@
 Gradients pass through the composition, so that an early motion is taught by all that follows from it.
 """
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -17,15 +19,26 @@ _LEAST_SIGMA = 1e-3
 class PoseErrors(nn.Module):
     """Errors of motions and poses, weighed by variances that are learned with the net (see LearnedWeights)."""
 
-    def __init__(self, *, log_variance_rotation: float, log_variance_translation: float, pose_weight: float) -> None:
-        """Start from these log-variances, ln rad² and ln m²; ``pose_weight`` is that of the poses' term."""
+    def __init__(
+        self, *, log_variance_rotation: float, log_variance_translation: float, window: int, pose_weight: float
+    ) -> None:
+        """Start from these log-variances of motions.
+
+        Args:
+            log_variance_rotation, log_variance_translation: ln rad² and ln m².
+            window: pairs of a window, of whose poses the variances start as if all errors were one.
+            pose_weight: of the poses' term.
+        """
         super().__init__()
-        start = {
-            "log_variance_rotation": log_variance_rotation,
-            "log_variance_translation": log_variance_translation,
-        }
-        self.motions = LearnedWeights(**start)
-        self.poses = LearnedWeights(**start)
+        # Mean of k² over the window.
+        grown = math.log((window + 1) * (2 * window + 1) / 6.0)
+        self.motions = LearnedWeights(
+            log_variance_rotation=log_variance_rotation, log_variance_translation=log_variance_translation
+        )
+        self.poses = LearnedWeights(
+            log_variance_rotation=log_variance_rotation + grown,
+            log_variance_translation=log_variance_translation + grown,
+        )
         self._pose_weight = pose_weight
 
     def forward(self, answer: CoreAnswer, T_prev_cur: Tensor, log_variances: Tensor | None) -> dict[str, Tensor]:
@@ -45,15 +58,19 @@ class PoseErrors(nn.Module):
 
 
 class PoseLikelihood(nn.Module):
-    """Likelihood of the true motions and poses, given the variances that the net states and what they compose to.
+    """Motions are taught as by :class:`PoseErrors`, and variances by how likely they make the errors that are left.
 
-    The poses' term sees that errors of consecutive motions resemble each other: it makes the net state variances
-    that are right for the sum, not only for each.
+    Taught by the likelihood too, motions would learn slowly where the net says of itself that it knows little, which is
+    what it says first. The likelihood is that of the motions and of the poses that they compose to: in these it shows
+    that errors of consecutive motions resemble each other, so that the variances are right for the sum.
     """
 
-    def __init__(self, *, rotation_unit_rad: float, translation_unit_m: float, pose_weight: float) -> None:
-        """Take the units in which errors are of the order of 1."""
+    def __init__(
+        self, means: PoseErrors, *, rotation_unit_rad: float, translation_unit_m: float, pose_weight: float
+    ) -> None:
+        """Take what teaches the motions, the units in which errors are of the order of 1, and the poses' weight."""
         super().__init__()
+        self.means = means
         self.motions = GaussianLikelihood()
         self._units = (rotation_unit_rad, translation_unit_m)
         self._pose_weight = pose_weight
@@ -71,25 +88,17 @@ class PoseLikelihood(nn.Module):
         """
         if log_variances is None:
             raise ValueError("a likelihood needs variances")
-        unit = answer.vector.new_tensor([self._units[0]] * 3 + [self._units[1]] * 3)
+        losses: dict[str, Tensor] = self.means(answer, T_prev_cur, None)
+        found, vector = answer.T_prev_cur.detach(), answer.vector.detach()
+        unit = vector.new_tensor([self._units[0]] * 3 + [self._units[1]] * 3)
+        errors = motion_errors(found, T_prev_cur) / unit
         scaled = log_variances - 2.0 * unit.log()
-        errors = motion_errors(answer.T_prev_cur, T_prev_cur)
-        motions = self.motions(errors / unit, torch.zeros_like(errors), scaled)
-        motions["rotation"] = errors[..., :3].detach().square().sum(-1).mean()
-        motions["translation"] = errors[..., 3:].detach().square().sum(-1).mean()
-        if not self._pose_weight:
-            return dict(motions)
-        covariance = covariance_from_log_variances(answer.vector, log_variances)
-        T_first_cur, T_true = compose(answer.T_prev_cur)[:, 1:], compose(T_prev_cur)[:, 1:]
-        stated = composed_covariance(answer.T_prev_cur, covariance)
-        errors = tangent_errors(T_first_cur, T_true)
-        likelihood = negative_log_likelihood(errors, stated, unit)
-        poses = {
-            "loss": likelihood.mean(),
-            "rotation": errors[..., :3].detach().square().sum(-1).mean(),
-            "translation": errors[..., 3:].detach().square().sum(-1).mean(),
-        }
-        return _sum(motions, poses, self._pose_weight)
+        likelihood = self.motions(errors, torch.zeros_like(errors), scaled)["loss"]
+        if self._pose_weight:
+            stated = composed_covariance(found, covariance_from_log_variances(vector, log_variances))
+            errors = tangent_errors(compose(found)[:, 1:], compose(T_prev_cur)[:, 1:])
+            likelihood = likelihood + self._pose_weight * negative_log_likelihood(errors, stated, unit).mean()
+        return {**losses, "loss": losses["loss"] + likelihood, "likelihood": likelihood.detach()}
 
 
 def motion_errors(T_found: Tensor, T_true: Tensor) -> Tensor:
