@@ -213,7 +213,8 @@ class Trainable(Protocol):
         net: all that is learned, the weights of a loss with several terms included, so that they are saved too.
         context_pairs: how many pairs of images in a row one answer takes, 1 or more.
         architecture: plain values on which a file of weights must agree with this part, such as
-            ``{"part": "tsvo", "backbone": "resnet50", "stack": 10}``.
+            ``{"part": "tsvo", "backbone": "resnet50", "stack": 10}``. One that reads embeddings says of what length
+            under ``embedding``.
         needs_training: its answers mean nothing yet: it was given no weights, and does not work without any. An
             experiment trains such a part first.
 
