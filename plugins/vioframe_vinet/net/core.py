@@ -137,10 +137,14 @@ class VinetCore(nn.Module):
                 with torch.no_grad():
                     parameter[hidden : 2 * hidden].fill_(1.0)
         self.joined = nn.Sequential(nn.Dropout(dropout), nn.Linear(hidden, joined), nn.ReLU(inplace=True))
-        self.answer = nn.Linear(joined, 2 * _MOTION if log_variances else _MOTION)
+        self.answer = nn.Linear(joined, _MOTION)
+        self.spread = nn.Linear(joined, _MOTION) if log_variances else None
         # At first close to no motion, or to the gyro's rotation, whatever it sees.
         nn.init.normal_(self.answer.weight, std=0.1 * joined**-0.5)
         nn.init.zeros_(self.answer.bias)
+        if self.spread is not None:
+            nn.init.normal_(self.spread.weight, std=0.1 * joined**-0.5)
+            nn.init.zeros_(self.spread.bias)
 
     def begin(self, sequences: int) -> CoreState:
         """The state of sequences that begin."""
@@ -189,7 +193,8 @@ class VinetCore(nn.Module):
         self, remembered: Tensor, gyro: _Gyro, duration_s: Tensor, state: CoreState
     ) -> tuple[CoreAnswer, CoreState]:
         # Single precision even where the layers before ran in half: a rotation of 0.01° would not survive that.
-        numbers = self.answer(self.joined(remembered)).float()
+        features = self.joined(remembered)
+        numbers = self.answer(features).float()
         turn = self._units[0] * numbers[..., :3]
         if self._gyro_turns:
             correction, state = self._mean_correction(turn, gyro.checked, state)
@@ -198,8 +203,9 @@ class VinetCore(nn.Module):
             R = product(gyro.turns.float(), exp_so3(turn))
         else:
             R = exp_so3(turn)
-        p = self._units[1] * numbers[..., 3:_MOTION]
-        variances = numbers[..., _MOTION:] if numbers.shape[-1] > _MOTION else None
+        p = self._units[1] * numbers[..., 3:]
+        # What is learned of errors must not bend what is learned of motions: the larger gradient is that of variances.
+        variances = None if self.spread is None else self.spread(features.detach()).float()
         return CoreAnswer(from_parts(R, p), torch.cat([log_so3(R), p], dim=-1), variances), state
 
     def _mean_correction(self, turn: Tensor, checked: Tensor, state: CoreState) -> tuple[Tensor, CoreState]:

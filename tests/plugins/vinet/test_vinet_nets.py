@@ -189,7 +189,7 @@ def test_it_learns_a_short_scene_through_the_front_end(loss):
     nets = torch.nn.ModuleList([front.net, fuser.net]).train()
     optimizer = torch.optim.Adam(nets.parameters(), lr=4e-3)
     seen = []
-    for _ in range(120):
+    for _ in range(60):
         losses = fuser.loss(fuser.forward_batch(batch, front.forward_batch(batch, {})), batch)
         optimizer.zero_grad()
         losses["loss"].backward()
@@ -198,5 +198,5 @@ def test_it_learns_a_short_scene_through_the_front_end(loss):
         if len(seen) == 1:
             for name, parameter in nets.named_parameters():
                 assert parameter.grad is not None and parameter.grad.isfinite().all(), name
-    assert seen[-1][0] < 0.25 * seen[0][0]
+    assert seen[-1][0] < 0.5 * seen[0][0]
     assert seen[-1][1] ** 0.5 < 0.02
