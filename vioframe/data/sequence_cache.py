@@ -2,10 +2,9 @@
 
 One shard is one recording, in a folder of its own: ``images.u8`` ((F, H, W, C) bytes, resized, then without loss),
 ``arrays.npz`` (stamps, poses, inertial samples, calibration) and ``manifest.json``, written last. What learns from the
-answers of a VO needs no images: they may be left out. The folder's
-name is a hash of what went in: the configuration of the data set, calibration, truth, the first frames' pixels, the
-size asked for and the version of this package. The manifest holds a hash of all that came out, which a trained net's
-card cites.
+answers of a VO needs no images: they may be left out. The folder's name is a hash of what went in: the configuration of
+the data set, calibration, truth, the first frames' pixels and the inertial samples before them, the size asked for and
+the version of this package. The manifest holds a hash of all that came out, which a trained net's card cites.
 """
 
 import errno
@@ -16,7 +15,7 @@ import os
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,7 @@ from vioframe.data.recording import CORRUPT_IMAGES, Recording
 from vioframe.data.windows import StoredSequence
 from vioframe.errors import ConfigError, DataError, VioframeError
 from vioframe.geometry.interpolation import differentiate_positions, interpolate_poses
-from vioframe.types import Camera, Frame, Image, ImuBlock, Packet, Trajectory
+from vioframe.types import Camera, Image, ImuBlock, Packet, Trajectory
 
 log = logging.getLogger(__name__)
 
@@ -130,12 +129,18 @@ class SequenceCache:
             arrays += [truth.stamps_ns, truth.T_world_body]
         for array in arrays:
             digest.update(np.ascontiguousarray(array).tobytes())
-        for number, frame in enumerate(_frames(recording)):
-            if number == _FRAMES_IN_KEY:
-                break
-            digest.update(frame.stamp_ns.to_bytes(8, "little", signed=True))
-            for image in frame.images[:1]:
+        frames = 0
+        for packet in recording.packets():
+            if isinstance(packet, ImuBlock):
+                for array in (packet.stamps_ns, packet.gyro, packet.accel):
+                    digest.update(np.ascontiguousarray(array).tobytes())
+                continue
+            digest.update(packet.stamp_ns.to_bytes(8, "little", signed=True))
+            for image in packet.images[:1]:
                 digest.update(np.ascontiguousarray(image).tobytes())
+            frames += 1
+            if frames == _FRAMES_IN_KEY:
+                break
         return digest.hexdigest()
 
     def _write(
@@ -319,12 +324,6 @@ def _check_losses(recording: Recording, stored: int) -> None:
         raise DataError(f"{text}: fetch them again, take the calibration of these images, or leave the recording out")
     if lost:
         log.warning("%s; they are left out of training", text)
-
-
-def _frames(recording: Recording) -> Iterator[Frame]:
-    for packet in recording.packets():
-        if isinstance(packet, Frame):
-            yield packet
 
 
 def _clean(name: str) -> str:

@@ -14,6 +14,7 @@ import hashlib
 import itertools
 import json
 import logging
+import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -51,6 +52,7 @@ log = logging.getLogger(__name__)
 
 _ASKED = ("frontend", "vo")
 _STREAMED = ("synchronizer", "frontend", "vo", "integrator")
+_MOST_DRAWS = 1000
 # Of the validation recordings: enough to choose weights by.
 _MOST_VALIDATION_DRAWS = 3
 
@@ -179,10 +181,9 @@ def _ask_drawing(
     made: list[Split] = []
     for split, count in zip(splits, (draws, min(draws, _MOST_VALIDATION_DRAWS)), strict=True):
         sequences, hashes = [], []
-        for number, (sequence, content) in enumerate(zip(split.sequences, split.hashes, strict=True)):
+        for sequence, content in zip(split.sequences, split.hashes, strict=True):
             for draw in range(count):
-                # No draw of one recording is that of another, nor that of a test.
-                changed = _with_seed(config, 1 + draw + 1000 * number + 500_000 * len(made))
+                changed = _with_seed(config, sequence.name, draw)
                 path = store.path(sequence.name, content, bearing_of(changed, "vo"), draw)
                 if not path.is_file():
                     write_answers(path, _draw(build(changed, "vo", VOEstimator, choices.get("vo", "")), sequence))
@@ -196,16 +197,17 @@ def _ask_drawing(
 
 def _draws(config: DictConfig) -> int:
     draws = OmegaConf.select(config, "training_data.draws", default=1)
-    if not isinstance(draws, int) or draws < 1:
-        raise ConfigError(f"training_data.draws must be a whole number of 1 or more, got {draws!r}")
+    if not isinstance(draws, int) or not 1 <= draws <= _MOST_DRAWS:
+        raise ConfigError(f"training_data.draws must be a whole number from 1 to {_MOST_DRAWS}, got {draws!r}")
     return draws if "seed" in config.vo else 1
 
 
-def _with_seed(config: DictConfig, further: int) -> DictConfig:
+def _with_seed(config: DictConfig, recording: str, draw: int) -> DictConfig:
+    """No draw of one recording is that of another, nor that of a test; it is the same whatever others there are."""
     if "seed" not in config.vo:
         return config
     changed = OmegaConf.create({"vo": OmegaConf.to_container(config.vo, resolve=True)})
-    changed.vo.seed = int(changed.vo.seed) + further
+    changed.vo.seed = int(changed.vo.seed) + 1 + draw + _MOST_DRAWS * (zlib.crc32(recording.encode()) % 1_000_000)
     return changed
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 SPLITS = ("train", "validation")
 # What names a recording; its cache entry must not depend on which others were asked for.
-_NAMING = ("sequence", "seed")
+_NAMING = ("sequence", "seed", "leave_out", "skip_last", "only_last")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,8 +120,16 @@ def splits_of(jobs: Sequence[DecodingJob], folders: Sequence[Path]) -> "tuple[Sp
 
 
 def _source(data: Mapping[str, Any], split: str) -> str:
-    node = {name: value for name, value in data["training_data"][split].items() if name not in _NAMING}
-    return OmegaConf.to_yaml(OmegaConf.create(node), sort_keys=True)
+    return OmegaConf.to_yaml(OmegaConf.create(_unnamed(data["training_data"][split])), sort_keys=True)
+
+
+def _unnamed(node: Mapping[str, Any]) -> dict[str, Any]:
+    """A data set's options less those that name recordings, and the same of those it is made from."""
+    return {
+        name: _unnamed(value) if isinstance(value, dict) else value
+        for name, value in node.items()
+        if name not in _NAMING
+    }
 
 
 def _store(job: DecodingJob) -> Path:
