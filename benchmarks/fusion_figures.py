@@ -48,6 +48,8 @@ def kitti(options: Options) -> Numbers:
             "experiment=fusion_kitti",
             f"dataset.root={options.folder()}",
             f"dataset.sequence=['{sequence}']",
+            # Said on the command line it wins over the odometry that a fuser brings.
+            "vo=error_model",
             f"vo.seed={seed}",
             f"trainer.seed={seed}",
         ]
@@ -63,6 +65,8 @@ def euroc(options: Options) -> Numbers:
             "experiment=fusion_euroc",
             f"dataset.source.root={options.folder()}",
             f"dataset.source.sequence=[{sequence}]",
+            "vo=stereo",
+            "rig=stereo",
             f"dataset.seed={seed}",
             f"trainer.seed={seed}",
         ]
