@@ -18,7 +18,7 @@ from vioframe.geometry import se3, so3
 from vioframe.interfaces import INERTIAL_DELTA, STEREO_TRACKS, TRACKS, Fuser
 from vioframe.tight.failure import FailureMonitor
 from vioframe.tight.options import CalibrationOptions, FailureOptions, InertialTrust
-from vioframe.tight.restart import DeadReckoning, coast_across
+from vioframe.tight.restart import DeadReckoning, coast_across, coast_through
 from vioframe.tight.scatter import SampleScatter
 from vioframe.tight.start import Starter, TightStartOptions
 from vioframe.tight.step import Start, Step, Support
@@ -141,12 +141,10 @@ class TightFuser(Fuser):
         if not self._ready:
             raise StateError(f"{type(self).__name__}.update was called before setup(rig): set the fuser up first")
         window = measurement.window
-        if not len(window.imu) and measurement.inertial_delta is None:
-            # As if no window had come: the next one with samples finds a hole before it, and crosses it.
-            self._count("windows without inertial samples")
-            return []
         if self._stamp_ns is not None and self._stamp_ns != window.previous.stamp_ns:
             self._cross_hole(window)
+        if not len(window.imu) and measurement.inertial_delta is None:
+            return self._go_without_samples(measurement)
         self._scatter.push(window)
         states: list[NavState] = []
         if self._running:
@@ -156,11 +154,29 @@ class TightFuser(Fuser):
                 self._past.move_on(self._step(measurement, at_rest=False))
             states = self._try_to_start(measurement)
         self._stamp_ns = window.current.stamp_ns
+        return [*states, *self._current(self._stamp_ns)]
+
+    def _current(self, stamp_ns: int) -> list[NavState]:
+        """The state now, where there is one."""
         if self._running:
-            states.append(replace(self._newest, stamp_ns=self._stamp_ns, status=self._status()))
-        elif self._past is not None:
-            states.append(self._past.state(self._stamp_ns))
-        return states
+            return [replace(self._newest, stamp_ns=stamp_ns, status=self._status())]
+        return [] if self._past is None else [self._past.state(stamp_ns)]
+
+    def _go_without_samples(self, measurement: Measurement) -> list[NavState]:
+        """Move on by a window whose inertial samples never came: coast, with what the images say."""
+        self._count("windows without inertial samples")
+        if not self._running:
+            self._starter.interrupt()
+        if self._running or self._past is not None:
+            # What there is a state of has a stamp.
+            begin = self._current(measurement.window.previous.stamp_ns)[0]
+            coasted = coast_through(begin, measurement, self._rig.gravity, self._inertial)
+            if self._past is not None:
+                self._past.move_on(self._step(coasted, at_rest=False))
+            else:
+                self._move_on(coasted)
+        self._stamp_ns = measurement.window.current.stamp_ns
+        return self._current(self._stamp_ns)
 
     def _new_start(self) -> None:
         self._starter = Starter(self._rig, self._start_options, self._calibration)

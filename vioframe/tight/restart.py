@@ -90,19 +90,29 @@ def coast_across(state: NavState, window: SyncedWindow, gravity: float, trust: I
         gravity: m/s².
         trust: how uncertain such a stretch is.
     """
+    before = replace(window.previous, stamp_ns=state.stamp_ns, images=())
+    made_up = SyncedWindow(previous=before, current=window.previous, imu=ImuBlock.none(), gap_ns=0)
+    return coast_through(state, Measurement(window=made_up), gravity, trust)
+
+
+def coast_through(state: NavState, measurement: Measurement, gravity: float, trust: InertialTrust) -> Measurement:
+    """A window that came without inertial samples, with those of constant velocity and attitude; what is seen stays.
+
+    Args:
+        state: at the start of the window.
+        measurement: the window, without samples and increment.
+        gravity: m/s².
+        trust: how uncertain such a stretch is.
+    """
+    window = measurement.window
     body = Body.of(state)
     down = np.array([0.0, 0.0, -gravity])
-    duration_ns = window.previous.stamp_ns - state.stamp_ns
-    delta = coasting(body, seconds(duration_ns), down, trust.gap_rate_sigma, trust.gap_accel_sigma)
+    stamps_ns = np.array([window.previous.stamp_ns, window.current.stamp_ns])
+    duration_ns = int(stamps_ns[1] - stamps_ns[0])
     lift = body.bias.accel - body.R.T @ down
-    made_up = SyncedWindow(
-        previous=replace(window.previous, stamp_ns=state.stamp_ns, images=()),
-        current=window.previous,
-        imu=ImuBlock(
-            stamps_ns=np.array([state.stamp_ns, window.previous.stamp_ns]),
-            gyro=np.tile(body.bias.gyro, (2, 1)),
-            accel=np.tile(lift, (2, 1)),
-        ),
-        gap_ns=duration_ns,
+    samples = ImuBlock(stamps_ns=stamps_ns, gyro=np.tile(body.bias.gyro, (2, 1)), accel=np.tile(lift, (2, 1)))
+    return replace(
+        measurement,
+        window=replace(window, imu=samples, gap_ns=duration_ns),
+        inertial_delta=coasting(body, seconds(duration_ns), down, trust.gap_rate_sigma, trust.gap_accel_sigma),
     )
-    return Measurement(window=made_up, inertial_delta=delta)
