@@ -176,8 +176,7 @@ class ResidualFuser(RelativePoseFuser):
         net = self._residual(self.net)
         if not self._options.bias_caution or not float(net.windows):
             return np.zeros(3), None
-        mean = doubles(net.gyro_bias)
-        spread = np.sqrt(np.maximum(doubles(net.gyro_bias_square) - mean**2, 0.0))
+        mean, spread = (doubles(each) for each in net.gyro_bias())
         return mean, self._options.bias_caution * np.maximum(spread, _LEAST_BIAS_SIGMA)
 
     def forward_batch(self, batch: "WindowBatch", upstream: "Mapping[str, Tensor]") -> "dict[str, Tensor]":
@@ -207,14 +206,18 @@ class ResidualFuser(RelativePoseFuser):
             pairs.duration_s[..., None]
         )
         log_variances = tensor(pairs.log_variances) + answers[..., 6:]
-        answered = max(len(pairs) - self._frames + 1, 1)
-        states = self._states(pairs, doubles(t_body), doubles(log_variances))
-        return {
-            "T_prev_cur": tensor(states[:, -answered:]),
+        told = {
             "corrected_shift": t_body,
             "corrected_log_variances": log_variances,
             "corrected_rotation": tensor(pairs.R_visual),
             "corrected_there": torch.from_numpy(pairs.visual).to(batch.T_prev_cur.device),
+        }
+        if net.training:
+            return told
+        answered = max(len(pairs) - self._frames + 1, 1)
+        return {
+            "T_prev_cur": tensor(self._states(pairs, doubles(t_body), doubles(log_variances))[:, -answered:]),
+            **told,
         }
 
     def loss(self, outputs: "Mapping[str, Tensor]", batch: "WindowBatch") -> "dict[str, Tensor]":
