@@ -91,8 +91,8 @@ class LearningOptions:
     window: int = 32
     decades: float = 3.0
     slope: float = 10.0
-    relative: float = 1.0
-    absolute: float = 1.0
+    relative: float = 3.0
+    absolute: float = 3.0
     likelihood: float = 1.0
     relative_rotation: float = 100.0
     absolute_rotation: float = 500.0

@@ -36,7 +36,10 @@ def filter_losses(poses: Tensor, covariances: Tensor, truth: Tensor, weights: Lo
         C2 = mean_k (κ2 ‖E_R − I‖²_F + |E_t|²) / k        what white errors add up to grows with k
         C3 = mean_k ½ (ζᵀ P⁻¹ ζ + ln det P) / 6            ζ: error of the pose, P: what the filter says of it
 
-    C1 and C2 alone do not see whether P is right: a gain only depends on ratios of variances.
+    and the loss is ``w1 ln C1 + w2 ln C2 + w3 C3``. The logarithms make errors of a car and of a hand weigh the same;
+    it is what variances learned for C1 and C2 come to (Kendall & Cipolla, CVPR 2017). C1 and C2 only see ratios of
+    variances, on which gains depend, and C3 their common size too; errors that last make C3 alone trust the odometry
+    more than is good for the poses.
 
     Args:
         poses: (B, S + 1, 4, 4) T_world_body of the filter.
@@ -65,7 +68,7 @@ def filter_losses(poses: Tensor, covariances: Tensor, truth: Tensor, weights: Lo
     spread = 2.0 * L.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     likelihood = 0.5 * (chi_square + spread).mean() / 6.0
 
-    total = weights.relative * relative + weights.absolute * absolute + weights.likelihood * likelihood
+    total = weights.relative * relative.log() + weights.absolute * absolute.log() + weights.likelihood * likelihood
     return {
         "loss": total,
         "relative": relative.detach(),
