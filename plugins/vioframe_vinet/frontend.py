@@ -2,12 +2,12 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import islice
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
 from vioframe.checks import Array, check_positive
-from vioframe.errors import DataError, StateError
+from vioframe.errors import ConfigError, DataError, StateError
 from vioframe.interfaces import EMBEDDING, IMAGES, Frontend
 from vioframe.learning.holder import NetHolder
 from vioframe.learning.images import NetImages
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from vioframe.learning.batch import WindowBatch
+    from vioframe_vinet.net.pair_flow import PairFlow
+
+Flow = Literal["dis", "none"]
 
 
 class PairEncoder(Frontend):
@@ -30,6 +33,7 @@ class PairEncoder(Frontend):
         features: numbers of the embedding, each between −1 and 1.
         width: factor on the channels of the convolutions.
         batch_norm: after each convolution.
+        flow: ``dis`` shows the convolutions the flow between the images too, found by dense inverse search; ``none``.
         batch: most pairs at once in :meth:`process_many`.
         weights: file of trained weights, in MLflow too, or None.
         device: ``cpu``, ``cuda`` or ``auto``.
@@ -49,6 +53,7 @@ class PairEncoder(Frontend):
         features: int = 256,
         width: float = 1.0,
         batch_norm: bool = True,
+        flow: Flow = "dis",
         batch: int = 8,
         weights: str | None = None,
         device: str = "auto",
@@ -60,9 +65,13 @@ class PairEncoder(Frontend):
         self._features = features
         self._width = width
         self._batch_norm = batch_norm
+        if flow not in ("dis", "none"):
+            raise ConfigError(f"frontend.flow must be one of dis, none, got {flow!r}")
+        self._with_flow = flow == "dis"
         self._batch = batch
         self._holder = NetHolder(self, "frontend", "pair_encoder", self._make_net, weights, device)
         self._before: Tensor | None = None
+        self._flow: PairFlow | None = None
         self._ready = False
 
     @property
@@ -96,6 +105,7 @@ class PairEncoder(Frontend):
             "features": self._features,
             "width": self._width,
             "batch_norm": self._batch_norm,
+            "flow": self._with_flow,
         }
 
     def setup(self, rig: SensorRig) -> None:
@@ -140,7 +150,7 @@ class PairEncoder(Frontend):
         """
         self._holder.taught()
         pairs = self._images.pairs_of_batch(batch.images)
-        embedding: Tensor = self.net.get_submodule("encoder")(pairs.flatten(0, 1))
+        embedding = self._embeddings(pairs.flatten(0, 1))
         return {EMBEDDING: embedding.reshape(*pairs.shape[:2], self._features)}
 
     def loss(self, outputs: "Mapping[str, Tensor]", batch: "WindowBatch") -> "dict[str, Tensor]":
@@ -163,11 +173,21 @@ class PairEncoder(Frontend):
         found = np.zeros((len(frames), self._features))
         if pairs:
             with torch.inference_mode():
-                found[numbers] = self.net.get_submodule("encoder")(torch.stack(pairs)).cpu().numpy()
+                found[numbers] = self._embeddings(torch.stack(pairs)).cpu().numpy()
         return [
             VisualFeatures(frame=frame, embedding=embedding if frame.images else None)
             for frame, embedding in zip(frames, found, strict=True)
         ]
+
+    def _embeddings(self, pairs: "Tensor") -> "Tensor":
+        """(N, D) of pairs (N, 6, H, W) in [0, 1]."""
+        from vioframe_vinet.net.pair_flow import PairFlow
+
+        if self._with_flow and self._flow is None:
+            self._flow = PairFlow()
+        flow = None if self._flow is None else self._flow.of_pairs(pairs)
+        embeddings: Tensor = self.net.get_submodule("encoder")(pairs, flow)
+        return embeddings
 
     def _make_net(self) -> "nn.Module":
         from torch import nn
@@ -175,6 +195,10 @@ class PairEncoder(Frontend):
         from vioframe_vinet.net.encoder import PairEncoderNet
 
         encoder = PairEncoderNet(
-            size_px=self._size, features=self._features, width=self._width, batch_norm=self._batch_norm
+            size_px=self._size,
+            features=self._features,
+            width=self._width,
+            batch_norm=self._batch_norm,
+            with_flow=self._with_flow,
         )
         return nn.ModuleDict({"encoder": encoder})

@@ -48,6 +48,7 @@ class FlowNetConvolutions(nn.Module):
         self,
         *,
         layers: Sequence[Layer] = LAYERS,
+        channels: int = PAIR_CHANNELS,
         width: float = 1.0,
         slope: float = 0.0,
         batch_norm: bool = False,
@@ -58,6 +59,7 @@ class FlowNetConvolutions(nn.Module):
 
         Args:
             layers: rows of the table.
+            channels: of what is given, two images and what else is known of them.
             width: factor on all channel counts, kept multiples of 8; 1 is the table.
             slope: of the rectifier below zero: 0 as the paper (ReLU), 0.1 as FlowNet.
             batch_norm: normalise after each convolution (whose bias is then dropped); neither paper does, but
@@ -66,7 +68,6 @@ class FlowNetConvolutions(nn.Module):
             last_dropout: after the last.
         """
         super().__init__()
-        channels = PAIR_CHANNELS
         self.strides = tuple(layer.stride for layer in layers)
         for position, layer in enumerate(layers):
             out = channels_at(layer.channels, width)
@@ -102,10 +103,17 @@ class FlowNetConvolutions(nn.Module):
 class SpatialStream(nn.Module):
     """Ten convolutions and a pool; 24 050 752 parameters and 8 × 4 → 4 × 2 maps at 512 × 256."""
 
-    def __init__(self, size_px: tuple[int, int], *, width: float = 1.0, batch_norm: bool = False) -> None:
+    def __init__(
+        self,
+        size_px: tuple[int, int],
+        *,
+        channels: int = PAIR_CHANNELS,
+        width: float = 1.0,
+        batch_norm: bool = False,
+    ) -> None:
         """Build the stream for images of ``size_px`` (width, height); other arguments as the convolutions'."""
         super().__init__()
-        self.convolutions = FlowNetConvolutions(width=width, batch_norm=batch_norm)
+        self.convolutions = FlowNetConvolutions(channels=channels, width=width, batch_norm=batch_norm)
         # Rounding up changes nothing at 512×256 and keeps the rim of maps of odd size, so that images below 128
         # pixels, whose last map is one pixel high, are possible.
         self.pool = nn.MaxPool2d(2, 2, ceil_mode=True)
