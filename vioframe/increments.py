@@ -94,7 +94,9 @@ def add_gap(delta: InertialDelta, gap_s: float, rate_sigma: float, accel_sigma: 
     return replace(delta, covariance=covariance, reintegrate=None)
 
 
-def coasting(body: Body, duration_s: float, gravity: Array, rate_sigma: float, accel_sigma: float) -> InertialDelta:
+def coasting(
+    body: Body, duration_s: float, gravity: Array, rate_sigma: float, accel_sigma: float, since_s: float = 0.0
+) -> InertialDelta:
     """The increment of a stretch without any sample: constant velocity and attitude, and little trust in it.
 
     Args:
@@ -103,6 +105,8 @@ def coasting(body: Body, duration_s: float, gravity: Array, rate_sigma: float, a
         gravity: (3,) m/s², in the world.
         rate_sigma: rad/s, of an unknown constant rate.
         accel_sigma: m/s², of an unknown constant acceleration.
+        since_s: how long there had been no measurement at all before it. Rate and acceleration are the same unknown
+            ones all the time, so variances grow with the square of the time: in pieces as at once.
     """
     lift = -body.R.T @ gravity
     blank = InertialDelta(
@@ -114,4 +118,6 @@ def coasting(body: Body, duration_s: float, gravity: Array, rate_sigma: float, a
         bias=body.bias,
         bias_jacobian=np.zeros((9, 6)),
     )
-    return add_gap(blank, duration_s, rate_sigma, accel_sigma)
+    # (since + duration)² − since², beside duration².
+    more = float(np.sqrt(1.0 + 2.0 * since_s / duration_s))
+    return add_gap(blank, duration_s, more * rate_sigma, more * accel_sigma)

@@ -111,6 +111,7 @@ class LooseFuser(Fuser):
         self._stamp_ns = 0
         self._supported_ns = 0
         self._refused_s = 0.0
+        self._silent_s = 0.0
         self._windows = 0
         self._counts: dict[str, int] = {}
         self._ready = True
@@ -144,7 +145,9 @@ class LooseFuser(Fuser):
             states.append(self._begin(self._given, covariance, window.previous.stamp_ns))
             self._given = None
         step = self._prepare(measurement)
-        self._account(step, self._advance(step))
+        supported = self._advance(step)
+        self._account(step, supported)
+        self._silent_s = 0.0 if supported or len(measurement.window.imu) else self._silent_s + step.delta.duration_s
         self._stamp_ns = step.current_ns
         self._windows += 1
         if self._windows % _NORMALISE_EVERY == 0:
@@ -196,7 +199,12 @@ class LooseFuser(Fuser):
         """The increment of a stretch without samples."""
         options = self._inertial
         return coasting(
-            self._filter.body, duration_s, self._filter.gravity, options.gap_rate_sigma, options.gap_accel_sigma
+            self._filter.body,
+            duration_s,
+            self._filter.gravity,
+            options.gap_rate_sigma,
+            options.gap_accel_sigma,
+            self._silent_s,
         )
 
     def _stand_still(self) -> bool:

@@ -81,6 +81,7 @@ class ImuOnlyFuser(Fuser):
         self._test = self._standstill.test(rig)
         self._given: NavState | None = None
         self._stamp_ns: int | None = None
+        self._silent_s = 0.0
         self._counts: Counter[str] = Counter()
 
     def start_from(self, state: NavState) -> None:
@@ -118,7 +119,9 @@ class ImuOnlyFuser(Fuser):
             self._counts["windows without inertial samples"] += 1
             duration = seconds(window.current.stamp_ns - window.previous.stamp_ns)
             self._filter.propagate(self._unseen(self._filter, duration))
+            self._silent_s += duration
         else:
+            self._silent_s = 0.0
             self._move(self._filter, measurement, delta)
         self._stamp_ns = window.current.stamp_ns
         states.append(self._filter.nav_state(self._stamp_ns, "tracking"))
@@ -130,7 +133,7 @@ class ImuOnlyFuser(Fuser):
         return filter_.nav_state(stamp_ns, "tracking")
 
     def _unseen(self, filter_: InertialFilter, duration_s: float) -> InertialDelta:
-        return coasting(filter_.body, duration_s, filter_.gravity, *self._gap_sigmas)
+        return coasting(filter_.body, duration_s, filter_.gravity, *self._gap_sigmas, self._silent_s)
 
     def _move(self, filter_: InertialFilter, measurement: Measurement, delta: InertialDelta) -> None:
         if (self._noise_scale != 1.0).any():

@@ -277,6 +277,34 @@ def test_missing_window_is_crossed_with_little_trust(walk):
     assert np.linalg.norm(error_after - error_before) < 1.0
 
 
+def test_windows_without_samples_are_coasted_through_with_what_is_seen(walk):
+    """Every window gives its state, the images still count as support, and the covariance grows."""
+    recording, recorded = walk
+    fuser = Reckoner()
+    fuser.setup(recording.rig)
+    fuser.start_from(recorded.true_state(recorded.measurements[0].window.previous.stamp_ns))
+    states, seen = [], []
+    advance = fuser._advance
+
+    def watch(step):
+        seen.append(len(step.tracks))
+        return advance(step)
+
+    fuser._advance = watch
+    for index, measurement in enumerate(recorded.measurements[:80]):
+        if 60 <= index < 70:
+            silent = replace(measurement.window, imu=ImuBlock.none(), gap_ns=50_000_000)
+            measurement = replace(measurement, window=silent, inertial_delta=None)
+        states += fuser.update(with_tracks()(index, measurement))
+    assert fuser.counters() == {"windows without inertial samples": 10}
+    assert len(states) == 81 and (np.diff([s.stamp_ns for s in states]) > 0).all()
+    assert seen == [30] * 80
+    before, after = states[60], states[70]
+    assert np.trace(after.covariance[6:9, 6:9]) > 1.5 * np.trace(before.covariance[6:9, 6:9])
+    np.testing.assert_allclose(after.v_world_body, before.v_world_body, atol=1e-9)
+    assert {s.status for s in states} == {"tracking"}
+
+
 def test_coasting_keeps_velocity_and_attitude():
     rng = np.random.default_rng(0)
     state = NavState(

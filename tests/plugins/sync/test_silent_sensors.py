@@ -23,11 +23,11 @@ DATASET = SimulatedDataset(duration_s=12.0, camera=CameraSettings(images=False))
 LOST_S = 2.0
 
 
-def drive(fuser: Fuser, **faults: object) -> tuple[list[NavState], Array]:
+def drive(fuser: Fuser, lost_share: float = 0.0, **faults: object) -> tuple[list[NavState], Array]:
     """States of a walk with these faults, and their position errors (N,) m."""
     recording = Faults(**faults).inject(DATASET).open("walk-0")  # type: ignore[arg-type]
     truth = recording.ground_truth()
-    vo = SimulatedVO()
+    vo = SimulatedVO(lost_share=lost_share)
     pipeline = Pipeline(synchronizer=SequentialCacheSynchronizer(), vo=vo, integrator=Preintegration(), fuser=fuser)
     pipeline.setup(recording.rig, initial_state("groundtruth", truth, recording.name))
     vo.take_ground_truth(recording.seen_truth())
@@ -63,3 +63,19 @@ def test_states_go_on_and_filters_recover(fuser: type[Fuser], start: float, sens
     if sensor == "camera_lost_s":
         assert {state.status for state, quiet in zip(states, silent, strict=True) if quiet} <= {"tracking", "lost"}
     assert states[-1].status == "tracking"
+
+
+@pytest.mark.parametrize("fuser", [EkfFuser, ImuOnlyFuser])
+def test_what_is_unknown_adds_up_as_one_unknown_motion(fuser: type[Fuser]) -> None:
+    """Two silent seconds in windows are as uncertain as at once: (2 m/s²)·(2 s) of vertical velocity.
+
+    Across, what is unknown of the tilt meanwhile turns gravity and adds to it.
+    """
+    states, _ = drive(fuser(), lost_share=1.0, imu_lost_s=((5.0, LOST_S),))
+    stamps = np.array([state.stamp_ns for state in states])
+    last = int(np.searchsorted(stamps, stamps[0] + round(6.99 * NANOSECONDS)))
+    covariance = states[last].covariance
+    assert covariance is not None
+    sigma = np.sqrt(np.diag(covariance)[6:9])
+    assert sigma[2] == pytest.approx(4.0, rel=0.1)
+    assert (sigma[:2] > 4.0).all() and (sigma[:2] < 12.0).all()
