@@ -17,7 +17,7 @@ class ResidualOptions:
         channels: width of the net.
         dropout: in training.
         bias_caution: factor on the spread of gyro biases over the training recordings, which is what the filter
-            assumes of the one it begins with; 0 leaves that to ``start``.
+            assumes of the one it begins with; 0 leaves that to ``start``, and the gyro's noise to the rig.
         horizons: pairs over which errors are summed up in training.
         speed_unit: m/s that the net takes for one.
         rate_unit: rad/s that it takes for one.
@@ -29,7 +29,7 @@ class ResidualOptions:
     channels: int = 48
     dropout: float = 0.1
     bias_caution: float = 2.0
-    horizons: Sequence[int] = (1, 4, 16, 64, 200)
+    horizons: Sequence[int] = (50, 100, 200)
     speed_unit: float = 10.0
     rate_unit: float = 0.3
     lost_share: float = 0.2

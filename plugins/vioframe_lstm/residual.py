@@ -28,7 +28,7 @@ from vioframe_lstm.pairs import (
     pairs_of_batch,
     transposed,
 )
-from vioframe_lstm.truth import gyro_biases, true_motions
+from vioframe_lstm.truth import gyro_errors, true_motions
 from vioframe_lstm.warning import IntervalCheck
 
 if TYPE_CHECKING:
@@ -36,9 +36,6 @@ if TYPE_CHECKING:
 
     from vioframe.learning.batch import WindowBatch
     from vioframe_lstm.net.residual import ResidualNet
-
-# rad/s: no gyro is known better.
-_LEAST_BIAS_SIGMA = 1e-5
 
 
 class ResidualFuser(RelativePoseFuser):
@@ -77,6 +74,7 @@ class ResidualFuser(RelativePoseFuser):
             raise ConfigError(f"fuser.frames must be 2 or more, got {frames}: a change takes two pairs")
         self._frames = frames
         self._options = residual
+        self._stated_inertial = self._inertial
         self._unstated = unstated_of(self._visual, self._inertial)
         self._holder = NetHolder(self, "fuser", "lstm", self._make_net, weights, device)
 
@@ -113,8 +111,9 @@ class ResidualFuser(RelativePoseFuser):
 
     def setup(self, rig: SensorRig) -> None:
         """Forget the last sequence, take the calibration, and bring the net to its device; errors as of the holder."""
-        super().setup(rig)
         net = self._residual(self._holder.prepare())
+        self._inertial = self._trust_in_gyro(rig)
+        super().setup(rig)
         self._interval = IntervalCheck(float(net.interval_s))
         self._last_ns: int | None = None
 
@@ -173,11 +172,18 @@ class ResidualFuser(RelativePoseFuser):
 
     def _gyro_bias(self) -> tuple[Array, Array | None]:
         """Mean (3,) and standard deviation (3,) rad/s over the training recordings; None if there were none."""
-        net = self._residual(self.net)
-        if not self._options.bias_caution or not float(net.windows):
+        known = self._residual(self.net).gyros.summary() if self._options.bias_caution else None
+        if known is None:
             return np.zeros(3), None
-        mean, spread = (doubles(each) for each in net.gyro_bias())
-        return mean, self._options.bias_caution * np.maximum(spread, _LEAST_BIAS_SIGMA)
+        return doubles(known[0]), self._options.bias_caution * doubles(known[1])
+
+    def _trust_in_gyro(self, rig: SensorRig) -> InertialOptions:
+        """The options with the noise that the gyros of the training recordings had, where that is more than stated."""
+        known = self._residual(self.net).gyros.summary() if self._options.bias_caution else None
+        if known is None or not rig.imu.gyro_noise:
+            return self._stated_inertial
+        more = max(float(known[2].square().mean().sqrt()) / rig.imu.gyro_noise, 1.0)
+        return replace(self._stated_inertial, gyro_noise_scale=self._stated_inertial.gyro_noise_scale * more)
 
     def forward_batch(self, batch: "WindowBatch", upstream: "Mapping[str, Tensor]") -> "dict[str, Tensor]":
         """Corrected motions of all pairs; as answers, those that look at as many pairs as in use.
@@ -194,7 +200,9 @@ class ResidualFuser(RelativePoseFuser):
         if net.training:
             if not float(net.interval_s):
                 net.interval_s.fill_(float(np.median(pairs.duration_s)))
-            net.learn_bias(torch.from_numpy(gyro_biases(pairs, doubles(batch.T_prev_cur))).to(net.windows.device))
+            errors, seconds_heard, which = gyro_errors(pairs, doubles(batch.T_prev_cur))
+            heard = (torch.from_numpy(errors), torch.from_numpy(seconds_heard), batch.recording.cpu()[which])
+            net.gyros.learn(*(each.to(net.interval_s.device) for each in heard))
             rng = np.random.default_rng(int(torch.randint(2**31, ())))
             pairs = lose_stretches(pairs, self._options.lost_share, self._options.lost_pairs, rng)
 

@@ -14,11 +14,16 @@ def true_motions(T_prev_cur: Array, T_body_cam: Array) -> tuple[Array, Array]:
     return R, turned(R_body_cam, T_prev_cur[..., :3, 3]) + p_body_cam - turned(R, p_body_cam)
 
 
-def gyro_biases(pairs: Pairs, T_prev_cur: Array) -> Array:
-    """Mean bias (W, 3) rad/s of the gyro in each window that has samples, of true motions (B, ≥ S, 4, 4)."""
+def gyro_errors(pairs: Pairs, T_prev_cur: Array) -> tuple[Array, Array, np.ndarray]:
+    """Mean errors (W, 3) rad/s of the gyro in the windows that have samples, over how long (W,) s, and which (W,).
+
+    Args:
+        pairs: (B, S).
+        T_prev_cur: (B, ≥ S, 4, 4) true motion of the camera.
+    """
     R_true, _ = true_motions(T_prev_cur[:, -len(pairs) :], pairs.T_body_cam)
     apart = so3.log(transposed(R_true) @ pairs.R_gyro) * pairs.inertial[..., None]
     seconds = (pairs.duration_s * pairs.inertial).sum(axis=1)
-    heard = seconds > 0.0
-    biases: Array = apart.sum(axis=1)[heard] / seconds[heard][:, None]
-    return biases[np.isfinite(biases).all(axis=-1)]
+    total = apart.sum(axis=1)
+    which = np.flatnonzero((seconds > 0.0) & np.isfinite(total).all(axis=-1))
+    return total[which] / seconds[which, None], seconds[which], which

@@ -7,14 +7,11 @@ from torch import Tensor, nn
 
 from vioframe_lstm.features import FEATURES
 from vioframe_lstm.net.causal import CausalNet, Memory
+from vioframe_lstm.net.gyros import GyroRecord
 from vioframe_lstm.net.likelihood import accumulated_likelihood
 
 ANSWERS = 12
 """Numbers that the net answers: gains of the three components of a shift, additions to them, ln of variances."""
-# Windows whose gyro biases are kept.
-_KEPT = 512
-# Standard deviation of a Gaussian for a median deviation of one.
-_FROM_MEDIAN = 1.4826
 # A factor of 150 on a standard deviation: what is worse than that carries no weight any more.
 _MOST_LOG_VARIANCE = 10.0
 # What an output of one means: a share of each component, a share of the speed unit, and ln of a variance.
@@ -32,20 +29,17 @@ class ResidualNet(nn.Module):
 
     Attributes:
         interval_s: from image to image in the training recordings, s; zero before any.
-        gyro_biases: (512, 3) rad/s, means over the last training windows.
-        windows: how many windows there were.
+        gyros: what gyros were off by.
     """
 
     interval_s: Tensor
-    gyro_biases: Tensor
-    windows: Tensor
 
     def __init__(self, *, frames: int, channels: int, dropout: float, speed_unit: float) -> None:
         super().__init__()
         self.causal = CausalNet(FEATURES, ANSWERS, channels=channels, frames=frames - 1, dropout=dropout)
         self._speed = _SPEED * speed_unit
-        for name, size in (("interval_s", ()), ("gyro_biases", (_KEPT, 3)), ("windows", ())):
-            self.register_buffer(name, torch.zeros(size, dtype=torch.float64))
+        self.gyros = GyroRecord()
+        self.register_buffer("interval_s", torch.zeros((), dtype=torch.float64))
 
     def forward(self, features: Tensor) -> Tensor:
         """Answers (B, S, ANSWERS) to features (B, S, FEATURES): shares, m/s, and ln of factors on variances."""
@@ -63,18 +57,6 @@ class ResidualNet(nn.Module):
             _DOUBT * answers[..., 6:].clamp(-half, half),
         ]
         return torch.cat(parts, dim=-1)
-
-    def learn_bias(self, biases: Tensor) -> None:
-        """Take the mean gyro biases (W, 3) rad/s of more training windows."""
-        place = (int(self.windows) + torch.arange(len(biases), device=biases.device)) % _KEPT
-        self.gyro_biases[place] = biases
-        self.windows += len(biases)
-
-    def gyro_bias(self) -> tuple[Tensor, Tensor]:
-        """Median (3,) of these and their spread (3,), rad/s: medians, since unnoticed holes are no bias."""
-        kept = self.gyro_biases[: min(int(self.windows), _KEPT)]
-        median = kept.median(0).values
-        return median, _FROM_MEDIAN * (kept - median).abs().median(0).values
 
 
 def likelihoods(
