@@ -278,7 +278,8 @@ class RelativePose:
         T_prev_cur: (4, 4). Translation in metres if the estimator provides ``metric_scale``; in one
             unknown unit, which may drift slowly, if ``consistent_scale``; else of unit length.
         covariance: (6, 6) or None; tangent (rotation, translation), right perturbation.
-        valid: False where the estimator does not stand by the motion; the rest is then meaningless.
+        valid: False where the estimator does not stand by the motion; the rest is then meaningless. What is not finite
+            is no motion: such an answer becomes one that is not valid, as numbers of a net may do in mid-run.
         inliers: number of points that agree with it.
     """
 
@@ -288,9 +289,12 @@ class RelativePose:
     inliers: int = 0
 
     def __post_init__(self) -> None:
-        check_array("RelativePose.T_prev_cur", self.T_prev_cur, (4, 4))
+        check_array("RelativePose.T_prev_cur", self.T_prev_cur, (4, 4), finite=False)
         if self.covariance is not None:
-            check_array("RelativePose.covariance", self.covariance, (6, 6))
+            check_array("RelativePose.covariance", self.covariance, (6, 6), finite=False)
+        if not all(value is None or np.isfinite(value).all() for value in (self.T_prev_cur, self.covariance)):
+            for name, value in {"T_prev_cur": np.eye(4), "covariance": None, "valid": False}.items():
+                object.__setattr__(self, name, value)
 
     def in_body(self, rig: SensorRig, scale: float = 1.0) -> Array:
         """Motion of the body, (4, 4), with the translation multiplied by ``scale`` (metres per unit)."""

@@ -122,6 +122,18 @@ def test_camera_motion_in_the_body_undoes_the_lever_arm():
     np.testing.assert_allclose(RelativePose(T_prev_cur=scaled).in_body(SCENE.rig, 4.0), T_prev_cur_body, atol=1e-12)
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_motion_that_is_not_finite_is_none(bad: float) -> None:
+    T = np.eye(4)
+    T[0, 3] = bad
+    covariance = np.eye(6)
+    covariance[2, 2] = bad
+    for pose in (RelativePose(T_prev_cur=T), RelativePose(T_prev_cur=np.eye(4), covariance=covariance)):
+        assert not pose.valid
+        np.testing.assert_array_equal(pose.T_prev_cur, np.eye(4))
+        assert pose.covariance is None
+
+
 def test_increment_at_another_bias_is_first_order_near_and_integrated_again_far():
     delta = measurement_of(SCENE, 0, SCENE.windows[0]).inertial_delta
     asked = []
