@@ -28,7 +28,7 @@ def accumulated_likelihood(
         variances: (B, S, 3) in the same axes.
         R_first_cur: (B, S, 3, 3) true attitude there.
         counted: (B, S) bool, where there is an error.
-        horizons: pairs; those longer than S are left out.
+        horizons: pairs; one that is longer than S counts as S.
     """
     R = R_first_cur.double() * counted[..., None, None]
     turned = (R @ errors.double()[..., None])[..., 0]
@@ -36,9 +36,7 @@ def accumulated_likelihood(
     sums, spreads, numbers = _running(turned), _running(spread), _running(counted.double())
     length = errors.shape[1]
     losses = []
-    for horizon in horizons:
-        if horizon > length:
-            continue
+    for horizon in sorted({min(horizon, length) for horizon in horizons}):
         starts = torch.arange(0, length - horizon + 1, max(horizon // 8, 1), device=errors.device)
         # A stretch with hardly a motion says nothing about stretches of its length.
         heard = 2.0 * (numbers[:, starts + horizon] - numbers[:, starts]) >= horizon

@@ -29,7 +29,9 @@ def lstm(head="residual", *, frames=FRAMES, pose=None, residual=None, **options)
         head=head,
         frames=frames,
         pose=PoseOptions(**{"width": 0.1, "kernel": 3, **(pose or {})}),
-        residual=ResidualOptions(**{"channels": 8, "dropout": 0.0, "lost_share": 0.0, **(residual or {})}),
+        residual=ResidualOptions(
+            **{"channels": 8, "dropout": 0.0, "lost_share": 0.0, "horizons": (4, 16, 30), **(residual or {})}
+        ),
         device="cpu",
         **options,
     )
