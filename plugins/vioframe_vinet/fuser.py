@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# In units of the output: one sample known to 2.5 thousandths of a unit must not outweigh all others.
-_LARGEST_LOG_VARIANCE = 12.0
-
 
 class VinetFuser(Fuser):
     """VINet (Clark et al. 2017): remembers from image to image without end, and states the motions it composes.
@@ -47,8 +44,9 @@ class VinetFuser(Fuser):
         dropout: in training, after the core and between its layers.
         axes: in which samples and motions are expressed: ``camera``, so that another mounting needs no training, or
             ``body``, for which no calibration of it is needed.
-        rotation: the net's is added to the ``gyro``'s, or ``learned`` whole.
-        gyro_memory: what is added to the gyro's is the mean over so many pairs, at most: its bias changes slowly.
+        rotation: the ``gyro``'s, corrected by what images say of its bias, or ``learned`` whole.
+        gyro_bias_sigma: rad/s an axis, of that bias at first.
+        gyro_memory: pairs after which what images said of it counts 1/e.
         feedback: the core sees its own ``pose`` since it began to remember, or ``none``.
         rotation_unit_rad: what an output of 1 means.
         translation_unit_m: likewise.
@@ -86,6 +84,7 @@ class VinetFuser(Fuser):
         dropout: float = 0.1,
         axes: Axes = "camera",
         rotation: Rotation = "gyro",
+        gyro_bias_sigma: float = 0.01,
         gyro_memory: int = 300,
         feedback: Feedback = "none",
         rotation_unit_rad: float = 0.005,
@@ -116,6 +115,7 @@ class VinetFuser(Fuser):
             dropout=dropout,
             axes=axes,
             rotation=rotation,
+            gyro_bias_sigma=gyro_bias_sigma,
             gyro_memory=gyro_memory,
             feedback=feedback,
             rotation_unit_rad=rotation_unit_rad,
@@ -270,19 +270,29 @@ class VinetFuser(Fuser):
             "T_prev_cur": moved_to(into_camera, answered),
         }
         if answer.log_variances is not None:
-            named["log_variances"] = self._limited(answer.log_variances)
+            named["log_variances"] = answer.log_variances
+        if answer.sight is not None:
+            named |= {"sight": answer.sight.vector, "sight_log_variances": answer.sight.log_variances}
+            named["visible"] = seen.visible
         return named
 
     def loss(self, outputs: "Mapping[str, Tensor]", batch: "WindowBatch") -> "dict[str, Tensor]":
         """``loss``, and mean squared errors (rad², m²) of motions and of poses since the window began."""
         from vioframe.learning.motion import product
         from vioframe_vinet.net.core import CoreAnswer
+        from vioframe_vinet.net.gyro import Sight
+        from vioframe_vinet.net.loss import sight_loss
         from vioframe_vinet.net.seeing import moved_to
 
         T_body_cam = batch.rig.T_body_cam
         truth = moved_to(product(self._axes(T_body_cam), T_body_cam)[:, None], batch.T_prev_cur)
         answer = CoreAnswer(outputs["motion"], outputs["vector"], None)
         losses: dict[str, Tensor] = self.net.get_submodule("weighing")(answer, truth, outputs.get("log_variances"))
+        if "sight" in outputs:
+            sight = Sight(outputs["sight"], outputs["sight_log_variances"])
+            losses["sight"] = sight_loss(sight, outputs["visible"], truth)
+            losses["loss"] = losses["loss"] + losses["sight"]
+            losses["sight"] = losses["sight"].detach()
         return losses
 
     def _embedding(self, measurement: Measurement) -> Array | None:
@@ -333,8 +343,8 @@ class VinetFuser(Fuser):
             motion = answer.T_prev_cur[0, 0].double().cpu().numpy()
             covariance = None
             if answer.log_variances is not None:
-                limited = self._limited(answer.log_variances)[0, 0].double()
-                covariance = covariance_from_log_variances(answer.vector[0, 0].double(), limited).cpu().numpy()
+                vector, spread = answer.vector[0, 0].double(), answer.log_variances[0, 0].double()
+                covariance = covariance_from_log_variances(vector, spread).cpu().numpy()
         if not np.isfinite(motion).all() or (covariance is not None and not np.isfinite(covariance).all()):
             return None
         motion[:3, :3] = so3.normalise(motion[:3, :3])
@@ -344,12 +354,6 @@ class VinetFuser(Fuser):
                 into_body = se3.adjoint(self._T_body_cam)
                 covariance = into_body @ covariance @ into_body.T
         return motion, covariance
-
-    def _limited(self, log_variances: "Tensor") -> "Tensor":
-        """Logarithms of rad² and m²; what is stated in use is what was taught."""
-        units = [self._options.rotation_unit_rad] * 3 + [self._options.translation_unit_m] * 3
-        limited = log_variances.clamp(-_LARGEST_LOG_VARIANCE, _LARGEST_LOG_VARIANCE)
-        return limited + 2.0 * log_variances.new_tensor(units).log()
 
     def _axes(self, T_body_cam: "Tensor") -> "Tensor":
         """T_axes_body (..., 4, 4) of the axes of the answer."""
@@ -362,40 +366,6 @@ class VinetFuser(Fuser):
         return torch.eye(4, dtype=T_body_cam.dtype, device=T_body_cam.device).expand_as(T_body_cam)
 
     def _make_net(self) -> "nn.Module":
-        from torch import nn
+        from vioframe_vinet.net.assembly import make_net
 
-        from vioframe_vinet.net.core import VinetCore
-        from vioframe_vinet.net.loss import PoseErrors, PoseLikelihood
-
-        options = self._options
-        core = VinetCore(
-            embedding=options.embedding,
-            imu_intervals=options.imu_intervals,
-            imu_hidden=options.imu_hidden,
-            imu_layers=options.imu_layers,
-            hidden=options.hidden,
-            layers=options.layers,
-            joined=options.joined,
-            dropout=options.dropout,
-            log_variances=options.log_variances,
-            gyro_turns=options.rotation == "gyro",
-            gyro_memory=options.gyro_memory,
-            feed_back_pose=options.feedback == "pose",
-            rotation_unit_rad=options.rotation_unit_rad,
-            translation_unit_m=options.translation_unit_m,
-        )
-        means = PoseErrors(
-            log_variance_rotation=options.log_variance_rotation,
-            log_variance_translation=options.log_variance_translation,
-            window=options.window,
-            pose_weight=options.pose_weight,
-        )
-        weighing: nn.Module = means
-        if options.loss == "likelihood":
-            weighing = PoseLikelihood(
-                means,
-                rotation_unit_rad=options.rotation_unit_rad,
-                translation_unit_m=options.translation_unit_m,
-                pose_weight=options.pose_weight,
-            )
-        return nn.ModuleDict({"core": core, "weighing": weighing})
+        return make_net(self._options)

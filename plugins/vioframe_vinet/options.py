@@ -33,7 +33,8 @@ class NetOptions:
         dropout: in training, after the core and between its layers.
         axes: in which samples and motions are expressed.
         rotation: added to the gyro's, or learned whole.
-        gyro_memory: of so many pairs, at most, the correction of the gyro is the mean.
+        gyro_bias_sigma: rad/s an axis, of the gyro's bias at first.
+        gyro_memory: pairs after which what images said of it counts 1/e.
         feedback: what the core sees of its own answers.
         rotation_unit_rad, translation_unit_m: what an output of 1 means.
         loss: ``learned`` weights, or the ``likelihood`` of a Gaussian with the variances stated.
@@ -56,6 +57,7 @@ class NetOptions:
     dropout: float
     axes: Axes
     rotation: Rotation
+    gyro_bias_sigma: float
     gyro_memory: int
     feedback: Feedback
     rotation_unit_rad: float
@@ -73,7 +75,12 @@ class NetOptions:
             value = getattr(self, name)
             if not isinstance(value, int) or value < 1:
                 raise ConfigError(f"fuser.{name} must be a whole number of 1 or more, got {value!r}")
-        check_positive("fuser", rotation_unit_rad=self.rotation_unit_rad, translation_unit_m=self.translation_unit_m)
+        check_positive(
+            "fuser",
+            rotation_unit_rad=self.rotation_unit_rad,
+            translation_unit_m=self.translation_unit_m,
+            gyro_bias_sigma=self.gyro_bias_sigma,
+        )
         check_not_negative("fuser", pose_weight=self.pose_weight)
         if not 0.0 <= self.dropout < 1.0:
             raise ConfigError(f"fuser.dropout must be from 0 to below 1, got {self.dropout}")
@@ -102,7 +109,6 @@ class NetOptions:
             "joined": self.joined,
             "axes": self.axes,
             "rotation": self.rotation,
-            "gyro_memory": self.gyro_memory,
             "feedback": self.feedback,
             "rotation_unit_rad": self.rotation_unit_rad,
             "translation_unit_m": self.translation_unit_m,

@@ -4,19 +4,21 @@ Clark, Wang, Wen, Markham, Trigoni, "VINet: Visual-Inertial Odometry as a Sequen
 AAAI 2017.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from vioframe.learning.motion import exp_so3, from_parts, log_so3, product
+from vioframe_vinet.net.gyro import USUAL_S, Bias, GyroCheck, Sight
 from vioframe_vinet.net.inertial import InertialEncoder, Resampled, turn_by_gyro
 
 _MOTION = 6
+# In squared units of the output: one sample known to 2.5 thousandths of a unit must not outweigh all others.
+_LARGEST_LOG_VARIANCE = 12.0
 # What a feature of 1 means: m of the pose that is fed back.
 _PLACE_UNIT = 10.0
-USUAL_S = 0.1
-"""What times between images are measured against, s."""
 
 
 class CoreState(NamedTuple):
@@ -25,15 +27,13 @@ class CoreState(NamedTuple):
     Attributes:
         hidden, cell: (layers, B, hidden).
         T_first_prev: (B, 4, 4) pose since it began to remember.
-        correction: (B, 3) rad in :data:`USUAL_S`, mean of what was to be added to the gyro.
-        corrected: (B,) of so many pairs.
+        bias: of the gyro, or None where rotation is not taken from it.
     """
 
     hidden: Tensor
     cell: Tensor
     T_first_prev: Tensor
-    correction: Tensor
-    corrected: Tensor
+    bias: Bias | None
 
     def rested(self) -> "CoreState":
         """After a hole of unknown length: what was seen is forgotten, what is known of the gyro is not."""
@@ -67,20 +67,30 @@ class CoreAnswer(NamedTuple):
     Attributes:
         T_prev_cur: (B, S, 4, 4) motions.
         vector: (B, S, 6) the same as (rotation vector rad, translation m).
-        log_variances: (B, S, 6) of its errors, in units of the output, or None.
+        log_variances: (B, S, 6) natural logarithms of rad² and m², of the vector's errors, or None.
+        sight: the rotation that images alone show, or None.
     """
 
     T_prev_cur: Tensor
     vector: Tensor
     log_variances: Tensor | None
+    sight: Sight | None = None
 
 
-class _Gyro(NamedTuple):
-    """What the gyro says: turns (B, S, 3, 3), whether it was heard, and whether images could check it, (B, S) bool."""
+class _Rotations(NamedTuple):
+    """What pairs say of rotation: turns (B, S, 3, 3) of the gyro, whether it was heard and images seen, (B, S) bool."""
 
     turns: Tensor
     heard: Tensor
-    checked: Tensor
+    visible: Tensor
+    sight: Sight | None
+    duration_s: Tensor
+
+    def at(self, k: int) -> "_Rotations":
+        """Those of the one pair k."""
+        now = slice(k, k + 1)
+        sight = None if self.sight is None else Sight(*(each[:, now] for each in self.sight))
+        return _Rotations(self.turns[:, now], self.heard[:, now], self.visible[:, now], sight, self.duration_s[:, now])
 
 
 class VinetCore(nn.Module):
@@ -99,6 +109,7 @@ class VinetCore(nn.Module):
         dropout: float,
         log_variances: bool,
         gyro_turns: bool,
+        gyro_bias_sigma: float,
         gyro_memory: int,
         feed_back_pose: bool,
         rotation_unit_rad: float,
@@ -114,19 +125,21 @@ class VinetCore(nn.Module):
             joined: neurons of the layer before the answer.
             dropout: in training, after the core and between its layers.
             log_variances: answer with variances too.
-            gyro_turns: answer with what is to be added to the gyro's rotation, instead of all of it.
-            gyro_memory: of so many pairs, at most, what is added is the mean: a gyro's bias changes slowly.
+            gyro_turns: take rotation from the gyro, corrected by what images say of its bias; the core then answers
+                with the translation alone.
+            gyro_bias_sigma: rad/s an axis, of that bias at first.
+            gyro_memory: pairs after which what images said counts 1/e.
             feed_back_pose: let the core see the pose since it began to remember.
             rotation_unit_rad, translation_unit_m: what an output of 1 means.
         """
         super().__init__()
         self.imu_intervals = imu_intervals
-        self._gyro_turns, self._feed_back = gyro_turns, feed_back_pose
-        self._gyro_memory = gyro_memory
+        self._feed_back = feed_back_pose
         self._units = (rotation_unit_rad, translation_unit_m)
         self.inertial = InertialEncoder(hidden=imu_hidden, layers=imu_layers)
-        # So many pairs without any correction are as good as what is not known of the bias at first: ln of it.
-        self.doubt = nn.Parameter(torch.zeros(())) if gyro_turns else None
+        self.gyro: GyroCheck | None = None
+        if gyro_turns:
+            self.gyro = GyroCheck(embedding=embedding, bias_sigma=gyro_bias_sigma, memory=gyro_memory)
         inputs = embedding + imu_hidden + 3 + (_MOTION if feed_back_pose else 0)
         # Torch warns of a dropout between the layers of a single one.
         self.core = nn.LSTM(inputs, hidden, layers, batch_first=True, dropout=dropout if layers > 1 else 0.0)
@@ -137,9 +150,9 @@ class VinetCore(nn.Module):
                 with torch.no_grad():
                     parameter[hidden : 2 * hidden].fill_(1.0)
         self.joined = nn.Sequential(nn.Dropout(dropout), nn.Linear(hidden, joined), nn.ReLU(inplace=True))
-        self.answer = nn.Linear(joined, _MOTION)
-        self.spread = nn.Linear(joined, _MOTION) if log_variances else None
-        # At first close to no motion, or to the gyro's rotation, whatever it sees.
+        self.answer = nn.Linear(joined, 3 if gyro_turns else _MOTION)
+        self.spread = nn.Linear(joined + (3 if gyro_turns else 0), _MOTION) if log_variances else None
+        # At first close to no motion, whatever it sees.
         nn.init.normal_(self.answer.weight, std=0.1 * joined**-0.5)
         nn.init.zeros_(self.answer.bias)
         if self.spread is not None:
@@ -151,8 +164,8 @@ class VinetCore(nn.Module):
         weight = self.answer.weight
         shape = (self.core.num_layers, sequences, self.core.hidden_size)
         identity = torch.eye(4, dtype=torch.float32, device=weight.device).expand(sequences, 4, 4)
-        none = torch.zeros(sequences, 3, dtype=torch.float32, device=weight.device)
-        return CoreState(weight.new_zeros(shape), weight.new_zeros(shape), identity, none, none[:, 0])
+        bias = None if self.gyro is None else self.gyro.begin(weight, sequences)
+        return CoreState(weight.new_zeros(shape), weight.new_zeros(shape), identity, bias)
 
     def forward(self, seen: Seen, state: CoreState | None = None) -> tuple[CoreAnswer, CoreState]:
         """Motions over the pairs, and the state to go on from; without a state the sequences begin."""
@@ -165,20 +178,20 @@ class VinetCore(nn.Module):
         embedding = torch.where(seen.visible[..., None], seen.embedding, torch.zeros_like(seen.embedding))
         told = [seen.visible.to(embedding.dtype), heard.to(embedding.dtype), seen.duration_s / USUAL_S - 1.0]
         inputs = torch.cat([embedding, features.reshape(batch, pairs, -1), torch.stack(told, dim=-1)], dim=-1)
-        gyro = _Gyro(turn_by_gyro(seen.samples).reshape(batch, pairs, 3, 3), heard, heard & seen.visible)
+        turns = turn_by_gyro(seen.samples).reshape(batch, pairs, 3, 3).float()
+        sight = None if self.gyro is None else self.gyro.see(embedding)
+        rotations = _Rotations(turns, heard, seen.visible, sight, seen.duration_s.float())
         if not self._feed_back:
             remembered, (hidden, cell) = self.core(inputs, (state.hidden, state.cell))
-            return self._answer(remembered, gyro, seen.duration_s, state._replace(hidden=hidden, cell=cell))
+            return self._answer(remembered, rotations, state._replace(hidden=hidden, cell=cell))
         answers = []
         for k in range(pairs):
-            now = slice(k, k + 1)
             pose = state.T_first_prev
             place = torch.cat([log_so3(pose[:, :3, :3]), pose[:, :3, 3] / _PLACE_UNIT], dim=-1)
-            step = torch.cat([inputs[:, now], place.to(inputs.dtype)[:, None]], dim=-1)
+            step = torch.cat([inputs[:, k : k + 1], place.to(inputs.dtype)[:, None]], dim=-1)
             remembered, (hidden, cell) = self.core(step, (state.hidden, state.cell))
             state = state._replace(hidden=hidden, cell=cell)
-            part = _Gyro(gyro.turns[:, now], gyro.heard[:, now], gyro.checked[:, now])
-            answer, state = self._answer(remembered, part, seen.duration_s[:, now], state)
+            answer, state = self._answer(remembered, rotations.at(k), state)
             answers.append(answer)
             state = state._replace(T_first_prev=product(pose, answer.T_prev_cur[:, 0]))
         variances = [each.log_variances for each in answers if each.log_variances is not None]
@@ -186,38 +199,34 @@ class VinetCore(nn.Module):
             torch.cat([each.T_prev_cur for each in answers], dim=1),
             torch.cat([each.vector for each in answers], dim=1),
             torch.cat(variances, dim=1) if variances else None,
+            sight,
         )
         return whole, state
 
-    def _answer(
-        self, remembered: Tensor, gyro: _Gyro, duration_s: Tensor, state: CoreState
-    ) -> tuple[CoreAnswer, CoreState]:
-        # Single precision even where the layers before ran in half: a rotation of 0.01° would not survive that.
+    def _answer(self, remembered: Tensor, rotations: _Rotations, state: CoreState) -> tuple[CoreAnswer, CoreState]:
         features = self.joined(remembered)
+        # Single precision even where the layers before ran in half: a rotation of 0.01° would not survive that.
         numbers = self.answer(features).float()
-        turn = self._units[0] * numbers[..., :3]
-        if self._gyro_turns:
-            correction, state = self._mean_correction(turn, gyro.checked, state)
-            heard = gyro.heard[..., None]
-            turn = torch.where(heard, correction * (duration_s / USUAL_S)[..., None], turn)
-            R = product(gyro.turns.float(), exp_so3(turn))
+        known = features.detach()
+        if self.gyro is None or rotations.sight is None or state.bias is None:
+            R = exp_so3(self._units[0] * numbers[..., :3])
         else:
-            R = exp_so3(turn)
-        p = self._units[1] * numbers[..., 3:]
+            sight = rotations.sight
+            checked = rotations.heard & rotations.visible
+            correction, variance, bias = self.gyro(rotations.turns, sight, checked, rotations.duration_s, state.bias)
+            heard = rotations.heard[..., None]
+            seen = torch.where(rotations.visible[..., None], sight.vector, torch.zeros_like(sight.vector))
+            R = product(rotations.turns, exp_so3(torch.where(heard, correction, seen)))
+            stated = torch.where(heard, variance.log(), sight.log_variances)
+            # Of the order of 1.
+            told = 0.2 * (stated.detach() - 2.0 * math.log(self._units[0]))
+            known = torch.cat([known, told.to(known.dtype)], dim=-1)
+            state = state._replace(bias=bias)
+        p = self._units[1] * numbers[..., -3:]
         # What is learned of errors must not bend what is learned of motions: the larger gradient is that of variances.
-        variances = None if self.spread is None else self.spread(features.detach()).float()
-        return CoreAnswer(from_parts(R, p), torch.cat([log_so3(R), p], dim=-1), variances), state
-
-    def _mean_correction(self, turn: Tensor, checked: Tensor, state: CoreState) -> tuple[Tensor, CoreState]:
-        """The mean (B, S, 3) of what was to be added to the gyro so far, where images could tell; and the new state."""
-        mean, count = state.correction, state.corrected
-        doubt = torch.ones_like(count) if self.doubt is None else self.doubt.exp().expand_as(count)
-        means = []
-        for k in range(turn.shape[1]):
-            fresh = checked[:, k].to(count.dtype)
-            count = (count + fresh).clamp_max(self._gyro_memory)
-            # Before the first, the mean is zero with the weight of ``doubt`` pairs.
-            share = (fresh / (count + doubt))[:, None]
-            mean = mean + share * (turn[:, k] - mean)
-            means.append(mean)
-        return torch.stack(means, dim=1), state._replace(correction=mean, corrected=count)
+        variances = None
+        if self.spread is not None:
+            limited = self.spread(known).float().clamp(-_LARGEST_LOG_VARIANCE, _LARGEST_LOG_VARIANCE)
+            variances = limited + 2.0 * limited.new_tensor([self._units[0]] * 3 + [self._units[1]] * 3).log()
+        vector = torch.cat([log_so3(R), p], dim=-1)
+        return CoreAnswer(from_parts(R, p), vector, variances, rotations.sight), state

@@ -9,11 +9,14 @@ import torch
 from torch import Tensor, nn
 
 from vioframe.learning.losses import GaussianLikelihood, LearnedWeights
-from vioframe.learning.motion import compose, covariance_from_log_variances, hat, inverse, log_so3, product
+from vioframe.learning.motion import compose, covariance_from_log_variances, exp_so3, hat, inverse, log_so3, product
 from vioframe_vinet.net.core import CoreAnswer
+from vioframe_vinet.net.gyro import Sight
 
 # Least standard deviation that the error of a pose is measured against, in units of the output.
 _LEAST_SIGMA = 1e-3
+# rad: what images show of rotation is weighed as if it erred by this.
+_SIGHT_UNIT = 0.005
 
 
 class PoseErrors(nn.Module):
@@ -99,6 +102,23 @@ class PoseLikelihood(nn.Module):
             errors = tangent_errors(compose(found)[:, 1:], compose(T_prev_cur)[:, 1:])
             likelihood = likelihood + self._pose_weight * negative_log_likelihood(errors, stated, unit).mean()
         return {**losses, "loss": losses["loss"] + likelihood, "likelihood": likelihood.detach()}
+
+
+def sight_loss(sight: Sight, visible: Tensor, T_prev_cur: Tensor) -> Tensor:
+    """How wrong the rotations are that images show, and how unlikely that is by the variances stated with them.
+
+    Args:
+        sight: of (B, S) pairs.
+        visible: (B, S) bool, of which there are images.
+        T_prev_cur: (B, S, 4, 4) true motions.
+    """
+    R_true = T_prev_cur[..., :3, :3]
+    errors = log_so3(product(R_true.transpose(-1, -2), exp_so3(sight.vector)))[visible]
+    spread = sight.log_variances[visible]
+    if not len(errors):
+        return sight.vector.sum() * 0.0
+    likelihood = 0.5 * (errors.detach().square() * torch.exp(-spread) + spread).sum(-1).mean()
+    return (errors / _SIGHT_UNIT).square().sum(-1).mean() + likelihood
 
 
 def motion_errors(T_found: Tensor, T_true: Tensor) -> Tensor:

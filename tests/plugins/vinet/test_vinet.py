@@ -133,7 +133,7 @@ def test_a_batch_of_images_is_encoded_as_they_come_one_by_one(scene):
 
 def test_gyro_alone_turns_a_net_that_has_learned_nothing(scene):
     """Its first answers are the rotation of the gyro, which here is exact, and no translation."""
-    front, fuser = encoder(), vinet(lively=False, dropout=0.0)
+    front, fuser = encoder(), vinet(lively=False, gyro_bias_sigma=1e-5)
     with torch.no_grad():
         fuser.net.get_submodule("core.answer").weight.zero_()
     states = stream(front, fuser, scene, scene.windows)
@@ -212,22 +212,20 @@ def test_a_hole_makes_it_begin_anew(scene):
     np.testing.assert_allclose(found, fresh, atol=1e-9)
 
 
-def test_what_is_known_of_the_gyro_survives_a_hole(scene):
-    """The net says the same of each pair; its mean is nearer to that after five pairs than after two."""
-    turns = []
+def test_what_images_say_of_the_gyro_survives_a_hole(scene):
+    """Images show no rotation, with little doubt: the gyro is taken to lack what it said, sooner after five pairs."""
+    sizes = []
     for windows in (scene.windows[6:8], [*scene.windows[:3], *scene.windows[6:8]]):
-        front, fuser = encoder(), vinet(lively=False)
+        front, fuser = encoder(), vinet(lively=False, gyro_bias_sigma=1.0)
         with torch.no_grad():
-            answer = fuser.net.get_submodule("core.answer")
-            answer.weight.zero_()
-            answer.bias[:3] = torch.tensor([1.0, 2.0, -1.0])
+            sight = fuser.net.get_submodule("core.gyro.sight.2")
+            sight.weight.zero_()
+            sight.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 3.0, 3.0, 3.0]))
         states = stream(front, fuser, scene, windows, start=False)
-        R = states[-2].T_world_body[:3, :3].T @ states[-1].T_world_body[:3, :3]
-        truth = scene.truth.T_world_body[7:9, :3, :3]
-        R_body_cam = scene.rig.cameras[0].T_body_cam[:3, :3]
-        turns.append(so3.log(R_body_cam.T @ (truth[0].T @ truth[1]).T @ R @ R_body_cam))
-    np.testing.assert_allclose(turns[0], 0.005 * np.array([1.0, 2.0, -1.0]) * 2 / 3, atol=1e-4)
-    np.testing.assert_allclose(turns[1], 0.005 * np.array([1.0, 2.0, -1.0]) * 5 / 6, atol=1e-4)
+        turn = so3.log(states[-2].T_world_body[:3, :3].T @ states[-1].T_world_body[:3, :3])
+        sizes.append(np.linalg.norm(turn))
+    truth = np.linalg.norm(so3.log(scene.truth.T_world_body[7, :3, :3].T @ scene.truth.T_world_body[8, :3, :3]))
+    assert sizes[1] < 0.8 * sizes[0] < truth
 
 
 def test_answers_that_are_no_numbers_are_counted_and_forgotten(scene):

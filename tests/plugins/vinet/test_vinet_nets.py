@@ -21,6 +21,7 @@ from vioframe.testing import make_scene
 from vioframe.types import ImuBlock
 from vioframe_vinet import PairEncoder, VinetFuser
 from vioframe_vinet.net.core import CoreAnswer
+from vioframe_vinet.net.gyro import GyroCheck, Sight
 from vioframe_vinet.net.inertial import Resampled, resample, turn_by_gyro
 from vioframe_vinet.net.loss import (
     PoseErrors,
@@ -28,6 +29,7 @@ from vioframe_vinet.net.loss import (
     composed_covariance,
     motion_errors,
     negative_log_likelihood,
+    sight_loss,
     tangent_errors,
 )
 from vioframe_vinet.net.seeing import stretches
@@ -78,6 +80,36 @@ def test_gyro_turns_by_its_integral():
     means[..., :3] = rate
     samples = Resampled(means, torch.tensor([0.2], dtype=torch.float64), torch.tensor([True]))
     torch.testing.assert_close(turn_by_gyro(samples)[0], exp_so3(0.2 * rate))
+
+
+def test_bias_of_the_gyro_is_what_least_squares_make_of_it():
+    """Without forgetting, the filter is a weighted mean of what images said, with the first guess as one of them."""
+    torch.manual_seed(0)
+    check = GyroCheck(embedding=4, bias_sigma=0.05, memory=10**9)
+    noise = torch.rand(1, 6, 3) * 1e-4
+    said = 0.01 * torch.randn(1, 6, 3)
+    sight = Sight(said, noise.log())
+    turns = torch.eye(3).expand(1, 6, 3, 3)
+    checked = torch.tensor([[True, True, False, True, True, True]])
+    usual = torch.full((1, 6), 0.1)
+    means, variances, _ = check(turns, sight, checked, usual, check.begin(said, 1))
+    weights = checked[..., None] / noise
+    information = weights.sum(1) + 1.0 / (0.05 * 0.1) ** 2
+    torch.testing.assert_close(means[:, -1], (weights * said).sum(1) / information, rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(variances[:, -1], 1.0 / information, rtol=1e-4, atol=1e-12)
+    # A pair that lasts twice as long turns by twice the bias.
+    longer, _, _ = check(turns, sight, checked, 2.0 * usual, check.begin(said, 1))
+    assert longer.isfinite().all()
+
+
+def test_what_images_show_of_rotation_is_taught_where_there_are_images():
+    _, truth = some_motions()
+    sight = Sight(torch.zeros(3, 5, 3, dtype=torch.float64, requires_grad=True), torch.zeros(3, 5, 3))
+    visible = torch.ones(3, 5, dtype=torch.bool)
+    visible[:, 2] = False
+    gradient = torch.autograd.grad(sight_loss(sight, visible, truth), sight.vector)[0]
+    assert not gradient[:, 2].any() and gradient[:, 3].any()
+    assert sight_loss(sight, torch.zeros_like(visible), truth).item() == 0.0
 
 
 @pytest.mark.parametrize("kind", ["errors", "likelihood"])
