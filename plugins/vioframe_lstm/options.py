@@ -60,6 +60,8 @@ class PoseOptions:
     Attributes:
         pose: of which the poses speak: ``relative`` to the first image of the window, or ``absolute``, to the first of
             all, as in the paper.
+        refines: the net's numbers correct the VO's pose at the window's end, a tenth of the units being one; else they
+            are the pose, as in the paper.
         activation: of what the LSTM puts out and of its cell: ``tanh``, or ``relu`` as in the paper.
         channels: of each convolution.
         kernel: frames that a convolution looks at.
@@ -77,6 +79,7 @@ class PoseOptions:
     """
 
     pose: Literal["relative", "absolute"] = "relative"
+    refines: bool = True
     activation: Literal["tanh", "relu"] = "tanh"
     channels: int = 64
     kernel: int = 11

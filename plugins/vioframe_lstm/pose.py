@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     from vioframe_lstm.net.pose import PoseNet
 
 
+# Options on which a file of weights must agree.
+_AGREED = ("pose", "refines", "activation", "padding", "kernel", "pool", "translation_unit", "rotation_unit")
+
+
 class PoseFuser(Fuser):
     """Convolutions and an LSTM over the last frames put out the pose of the body; see the README.
 
@@ -97,7 +101,16 @@ class PoseFuser(Fuser):
             "poses": self._poses,
             **{
                 name: getattr(options, name)
-                for name in ("pose", "activation", "padding", "kernel", "pool", "translation_unit", "rotation_unit")
+                for name in (
+                    "pose",
+                    "refines",
+                    "activation",
+                    "padding",
+                    "kernel",
+                    "pool",
+                    "translation_unit",
+                    "rotation_unit",
+                )
             },
             **{name: options.scaled(getattr(options, name)) for name in ("channels", "hidden", "head")},
         }
@@ -214,7 +227,11 @@ class PoseFuser(Fuser):
         rotation = torch.from_numpy(so3.log(R).astype(np.float32)).to(device)
         position = torch.from_numpy(p.astype(np.float32)).to(device)
         answers: Tensor = self._pose_net()(rotation, position, torch.from_numpy(present.copy()).to(device))
-        return answers
+        if not self._options.refines:
+            return answers
+        # The first of the poses of each frame is the VO's.
+        visual = torch.from_numpy(se3.from_parts(R[:, -1, 0], p[:, -1, 0]).astype(np.float32)).to(device)
+        return visual @ answers
 
     def _answer(self, measurement: Measurement) -> Array:
         """T_world_body at the window's end."""

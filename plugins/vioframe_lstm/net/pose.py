@@ -10,6 +10,9 @@ from vioframe.learning.motion import exp_so3, from_parts, log_so3, product
 from vioframe_lstm.net.relu_lstm import ReluLstm
 from vioframe_lstm.options import PoseOptions
 
+# Of the units, what corrections are measured in.
+_REFINED = 0.1
+
 
 class Branch(nn.Module):
     """Three convolutions and a pool over frames; what lies before the recording stays zero."""
@@ -34,7 +37,7 @@ class Branch(nn.Module):
 
 
 class PoseNet(nn.Module):
-    """A window's stack to the pose at its end.
+    """A window's stack to the pose at its end, or to what the VO's is to be corrected by.
 
     Args:
         options: of the head.
@@ -48,6 +51,7 @@ class PoseNet(nn.Module):
 
     def __init__(self, options: PoseOptions, poses: int) -> None:
         super().__init__()
+        self._share = _REFINED if options.refines else 1.0
         self._units = (options.rotation_unit, options.translation_unit)
         self.register_buffer("interval_s", torch.zeros((), dtype=torch.float64))
         self.attitude = Branch(3 * (poses + 1), options)
@@ -58,6 +62,10 @@ class PoseNet(nn.Module):
         self.dropout = nn.Dropout(options.dropout)
         self.neck = nn.Linear(hidden, options.scaled(options.head))
         self.exit = nn.Linear(options.scaled(options.head), 6)
+        if options.refines:
+            # Untrained, the poses are the VO's.
+            nn.init.zeros_(self.exit.weight)
+            nn.init.zeros_(self.exit.bias)
 
     def forward(self, rotation: Tensor, p: Tensor, present: Tensor) -> Tensor:
         """Poses (W, 4, 4) of stacks (W, M, N + 1, 3) of rotation vectors and positions, and present (W, M) bool."""
@@ -67,7 +75,7 @@ class PoseNet(nn.Module):
         position = (p / translation_unit).flatten(2).transpose(1, 2) * mask
         joint = torch.cat([self.attitude(attitude, mask), self.position(position, mask)], dim=1).transpose(1, 2)
         remembered = self.dropout(self.second(self.dropout(self.first(joint))))
-        numbers = self.exit(self.neck(remembered[:, -1])).float()
+        numbers = self._share * self.exit(self.neck(remembered[:, -1])).float()
         return from_parts(exp_so3(rotation_unit * numbers[:, :3]), translation_unit * numbers[:, 3:])
 
 

@@ -51,7 +51,7 @@ HEADS = pytest.mark.parametrize(
     [
         lambda **options: lstm(**options),
         lambda **options: lstm("pose", **options),
-        lambda **options: lstm("pose", pose={"pose": "absolute", "activation": "relu"}, **options),
+        lambda **options: lstm("pose", pose={"pose": "absolute", "activation": "relu", "refines": False}, **options),
         lambda **options: lstm("pose", pose={"padding": "valid"}, **options),
     ],
     ids=["residual", "pose", "as the paper", "valid padding"],
