@@ -147,7 +147,10 @@ class SequentialCacheSynchronizer(BufferedSynchronizer):
         if self._waiting and self._waiting[0].stamp_ns - start_ns <= limit_ns:
             return self._waiting.pop(0) if self._certain(self._waiting[0].stamp_ns, ended) else None
         if self._waiting:
-            return self._over_hole(start_ns) if self._certain(start_ns + self._usual_ns, ended) else None
+            # Where no sample is known either, one may yet come between the hole and the image.
+            silent = self._sample_after(start_ns) is None
+            next_ns = self._waiting[0].stamp_ns if silent else start_ns + self._usual_ns
+            return self._over_hole(start_ns) if self._certain(next_ns, ended) else None
         newest_ns = self._newest_imu_ns
         patience_ns = 0 if ended else self._max_wait_ns
         if newest_ns is None or newest_ns - start_ns <= limit_ns + patience_ns:

@@ -207,6 +207,16 @@ def test_the_order_of_arrival_does_not_matter(seed: int) -> None:
         np.testing.assert_array_equal(one.imu.gyro, other.imu.gyro)
 
 
+def test_an_image_after_a_hole_of_both_sensors_waits_for_the_samples_before_it() -> None:
+    tidy = stream([t for t in IMAGES if not 3000.0 < t < 4500.0], without(SAMPLES, 3000.0, 4000.0))
+    # The samples since 4 s arrive just after the image at 4.5 s.
+    early = sorted(tidy, key=lambda p: 4000 * MS if isinstance(p, Frame) and p.stamp_ns == 4500 * MS else newest(p))
+    expected, got = run(started(), tidy), run(started(), early)
+    assert (3000.0, 4000.0) in ends(expected)
+    assert ends(got) == ends(expected)
+    assert [len(window.imu) for window in got] == [len(window.imu) for window in expected]
+
+
 def test_nothing_waits_longer_than_told() -> None:
     """States are at most the wait behind the stream while one sensor is silent, whichever it is."""
     for images, samples in (
