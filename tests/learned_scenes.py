@@ -3,6 +3,7 @@
 import numpy as np
 
 from vioframe.data.recording import Dataset, Recording
+from vioframe.data.simulated_vo import SimulatedVO
 from vioframe.data.windows import StoredSequence
 from vioframe.testing import Scene, make_scene
 
@@ -67,3 +68,10 @@ class SceneDataset(Dataset):
 
     def open(self, sequence):
         return self.recordings[sequence]
+
+
+class Truthful(SimulatedVO):
+    """Answers the truth, whatever its weights are."""
+
+    def __init__(self, *, weights: str) -> None:
+        super().__init__(rotation_noise=0.0, translation_noise=0.0)

@@ -18,11 +18,13 @@ from vioframe.build import build, build_pipeline
 from vioframe.data.answers import read_answers, stack_answers, write_answers
 from vioframe.data.recording import Dataset
 from vioframe.data.remaining import RemainingSequences
+from vioframe.data.sequence_cache import SequenceCache, read_stored
 from vioframe.errors import ConfigError, DataError
 from vioframe.geometry import se3
 from vioframe.learning.answers import LearnedAnswers
 from vioframe.learning.training import Split, train_parts
-from vioframe.tasks.answers import read_answered_splits
+from vioframe.tasks.answers import _Store, _stream, _StreamJob, read_answered_splits
+from vioframe.tasks.decoding import DecodingJob
 from vioframe.tasks.fitting import trainer_options
 from vioframe.tasks.provision import provide_weights, untrained_slots
 from vioframe.tasks.train import _learns_from_answers
@@ -135,6 +137,32 @@ def test_drawn_answers_are_others_each_time_and_asked_once(tmp_path, monkeypatch
     monkeypatch.setattr("vioframe.tasks.answers._draw", refuse)
     again, _ = read_answered_splits(config, chosen, CHOICES, shown=False)
     assert again.hashes == train.hashes
+
+
+def test_other_parts_are_streamed_and_asked_again_only_for_other_weights(tmp_path, monkeypatch):
+    monkeypatch.setattr(DecodingJob, "open", lambda job: SceneRecording())
+    monkeypatch.setattr("vioframe.build.TRUSTED_LIBRARIES", ("learned_scenes",))
+    data = DecodingJob(
+        data={}, split="train", choice="", name="scene", source="scene",
+        cache=SequenceCache(tmp_path / "recordings", size_px=(32, 24), channels=1, images=False),
+    )  # fmt: skip
+    weights = tmp_path / "weights"
+    weights.write_bytes(b"one")
+    parts = {
+        "synchronizer": {"_target_": "vioframe_sync.InterpolateSynchronizer"},
+        "vo": {"_target_": "learned_scenes.Truthful", "weights": str(weights)},
+    }
+    job = _StreamJob(decoding=data, parts=parts, choices={}, store=_Store(tmp_path / "answers", "truthful"))
+    stored_in, path = _stream(job)
+    sequence, _ = read_stored(stored_in)
+    answers = read_answers(path)
+    assert answers.valid.all()
+    np.testing.assert_allclose(answers.T_prev_cur, sequence.motions(), atol=1e-9)
+    # What another run has stored meanwhile is streamed all the same.
+    path.unlink()
+    np.testing.assert_array_equal(read_answers(_stream(job)[1]).T_prev_cur, answers.T_prev_cur)
+    weights.write_bytes(b"other")
+    assert _stream(job)[1] != path
 
 
 class Trusting:

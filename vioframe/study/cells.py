@@ -18,6 +18,7 @@ from vioframe import __version__
 from vioframe.build import build_dataset, build_pipeline
 from vioframe.errors import ConfigError, VioframeError
 from vioframe.evaluation.rows import evaluate_run, metrics_document
+from vioframe.tasks.bearing import bearing
 from vioframe.tasks.experiment import build_options
 from vioframe.tasks.run_sequence import run_sequence
 from vioframe.tracking.records import metrics_of
@@ -75,7 +76,8 @@ def cell_key(config: DictConfig) -> str:
         ConfigError: an option leads nowhere, or is missing.
     """
     plain = {str(name): _plain(config, str(name)) for name in config if name not in _NO_BEARING}
-    words = [__version__, _bearing(plain)]
+    # Whether figures are drawn changes no number.
+    words = [__version__, bearing(plain, without=("plots",))]
     return hashlib.sha256(json.dumps(words, sort_keys=True, default=str).encode()).hexdigest()[:24]
 
 
@@ -86,20 +88,6 @@ def _plain(config: DictConfig, name: str) -> object:
         return OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
     except OmegaConfBaseException as error:
         raise ConfigError(f"{name}: {str(error).strip().splitlines()[0]}") from error
-
-
-def _bearing(node: object) -> object:
-    """Of an option what has a bearing: of files of weights the content, not the name."""
-    if isinstance(node, list):
-        return [_bearing(value) for value in node]
-    if not isinstance(node, dict):
-        return node
-    kept = {str(name): _bearing(value) for name, value in node.items() if name not in ("device", "cache", "plots")}
-    source = kept.get("weights")
-    if isinstance(source, str) and Path(source).expanduser().is_file():
-        with Path(source).expanduser().open("rb") as file:
-            kept["weights"] = hashlib.file_digest(file, "sha256").hexdigest()
-    return kept
 
 
 class CellStore:

@@ -244,7 +244,7 @@ def _stream(job: _StreamJob) -> tuple[Path, Path]:
     advance = telling(recording.frame_count + 1)
     cache, source = job.decoding.cache, job.decoding.source
     stored = cache.place(recording, source)
-    path = job.store.path(recording.name, stored.name, job.parts)
+    path = job.store.path(recording.name, stored.name, bearing(dict(job.parts)))
     if path.is_file():
         cache.store(recording, source, advance)
     else:
@@ -252,21 +252,23 @@ def _stream(job: _StreamJob) -> tuple[Path, Path]:
         pipeline = _listening(job, listener)
         pipeline.setup(recording.rig)
         lend_ground_truth(pipeline, recording.ground_truth(), recording.name)
-        # What is decoded for one purpose is decoded for both.
-        if (stored / "manifest.json").is_file():
-            for number, packet in enumerate(recording.packets()):
-                pipeline.push(packet)
-                advance(min(number, recording.frame_count))
-        else:
-            cache.store(recording, source, advance, lambda packet: _push(pipeline, packet))
+        heard = 0
+
+        def push(packet: Packet) -> None:
+            nonlocal heard
+            pipeline.push(packet)
+            heard += 1
+
+        # What is decoded for one purpose is decoded for both, unless it was before: by another run just now, perhaps.
+        cache.store(recording, source, advance, push)
+        if not heard:
+            for packet in recording.packets():
+                push(packet)
+                advance(min(heard, recording.frame_count))
         pipeline.flush()
         write_answers(path, stack_answers(read_stored(stored)[0].stamps_ns, listener.poses))
     advance(recording.frame_count + 1)
     return stored, path
-
-
-def _push(pipeline: Pipeline, packet: Packet) -> None:
-    pipeline.push(packet)
 
 
 def _listening(job: _StreamJob, listener: _Listener) -> Pipeline:

@@ -1,6 +1,7 @@
 """What of a part's options has a bearing on what it learns or answers: the words of a cache's key."""
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -14,11 +15,18 @@ def bearing_of(config: DictConfig, slot: str) -> object:
     return bearing(OmegaConf.to_container(config[slot], resolve=True))
 
 
-def bearing(node: object) -> object:
-    """The same of options that are plain already."""
+def bearing(node: object, without: Sequence[str] = ()) -> object:
+    """The same of options that are plain already.
+
+    Args:
+        node: options.
+        without: names of further ones that have no bearing, wherever they stand.
+    """
+    if isinstance(node, list):
+        return [bearing(value, without) for value in node]
     if not isinstance(node, dict):
         return node
-    kept = {name: bearing(value) for name, value in node.items() if name not in _WITHOUT}
+    kept = {str(name): bearing(value, without) for name, value in node.items() if name not in (*_WITHOUT, *without)}
     source = kept.get("weights")
     if isinstance(source, str) and Path(source).expanduser().is_file():
         with Path(source).expanduser().open("rb") as file:
