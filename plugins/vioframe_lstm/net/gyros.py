@@ -37,9 +37,9 @@ class GyroRecord(nn.Module):
     def learn(self, errors: Tensor, seconds: Tensor, recordings: Tensor) -> None:
         """Take more windows: (W, 3) rad/s, (W,) s, (W,) numbers of recordings."""
         place = (int(self.count) + torch.arange(len(errors), device=errors.device)) % _KEPT
-        self.errors[place] = errors
-        self.seconds[place] = seconds
-        self.recordings[place] = recordings.to(self.recordings.dtype)
+        self.errors[place] = errors.to(self.errors)
+        self.seconds[place] = seconds.to(self.seconds)
+        self.recordings[place] = recordings.to(self.recordings)
         self.count += len(errors)
 
     def summary(self) -> tuple[Tensor, Tensor, Tensor] | None:
