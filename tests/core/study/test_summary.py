@@ -99,7 +99,7 @@ def test_unknown_metric_is_shown_under_its_own_name():
 
 
 def test_what_was_not_run_is_not_called_undefined(capsys):
-    told = summary({"ekf": {0.0: (1.0, 1.0), 0.01: (1.0, 1.0)}}, VALUES)
+    told = summary({"ekf": {0.0: (1.0, 1.0), 0.01: (1.0, 1.0)}}, VALUES, "study.chosen=[ekf,msf]")
     assert told.sentences() == ["ekf: t_rel 1.00 % at 0 ms; within 10 % of that from 0 to 10 ms.", "msf: not run."]
     print_study(told)
     assert "[ms]" in capsys.readouterr().out
