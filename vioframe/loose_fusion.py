@@ -194,6 +194,7 @@ class LooseFuser(Fuser):
         self._count("missing windows")
         delta = self._coasting(seconds(window.previous.stamp_ns - self._stamp_ns))
         self._advance(Step(delta=delta, motion=None, at_rest=False, current_ns=window.previous.stamp_ns))
+        self._silent_s += delta.duration_s
 
     def _coasting(self, duration_s: float) -> InertialDelta:
         """The increment of a stretch without samples."""

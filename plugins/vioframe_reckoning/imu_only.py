@@ -114,12 +114,10 @@ class ImuOnlyFuser(Fuser):
             self._given = None
         if self._stamp_ns is not None and self._stamp_ns != window.previous.stamp_ns:
             self._counts["missing windows"] += 1
-            self._filter.propagate(self._unseen(self._filter, seconds(window.previous.stamp_ns - self._stamp_ns)))
+            self._coast(self._filter, seconds(window.previous.stamp_ns - self._stamp_ns))
         if delta is None:
             self._counts["windows without inertial samples"] += 1
-            duration = seconds(window.current.stamp_ns - window.previous.stamp_ns)
-            self._filter.propagate(self._unseen(self._filter, duration))
-            self._silent_s += duration
+            self._coast(self._filter, seconds(window.current.stamp_ns - window.previous.stamp_ns))
         else:
             self._silent_s = 0.0
             self._move(self._filter, measurement, delta)
@@ -132,8 +130,9 @@ class ImuOnlyFuser(Fuser):
         self._stamp_ns = stamp_ns
         return filter_.nav_state(stamp_ns, "tracking")
 
-    def _unseen(self, filter_: InertialFilter, duration_s: float) -> InertialDelta:
-        return coasting(filter_.body, duration_s, filter_.gravity, *self._gap_sigmas, self._silent_s)
+    def _coast(self, filter_: InertialFilter, duration_s: float) -> None:
+        filter_.propagate(coasting(filter_.body, duration_s, filter_.gravity, *self._gap_sigmas, self._silent_s))
+        self._silent_s += duration_s
 
     def _move(self, filter_: InertialFilter, measurement: Measurement, delta: InertialDelta) -> None:
         if (self._noise_scale != 1.0).any():

@@ -12,7 +12,7 @@ from vioframe.errors import ConfigError, StateError
 from vioframe.fusion_options import StandstillOptions
 from vioframe.geometry import so3
 from vioframe.testing import check_component
-from vioframe.types import ImuBias, ImuBlock, ImuNoise, Measurement, NavState, SensorRig, SyncedWindow
+from vioframe.types import Frame, ImuBias, ImuBlock, ImuNoise, Measurement, NavState, SensorRig, SyncedWindow
 from vioframe_preintegration import Preintegration
 from vioframe_reckoning import ImuOnlyFuser
 
@@ -68,6 +68,24 @@ def test_noise_scales_widen_their_own_part() -> None:
     np.testing.assert_allclose(sigmas[1][:3], 3.0 * sigmas[0][:3], rtol=1e-3)
     np.testing.assert_allclose(sigmas[2][:3], sigmas[0][:3], rtol=1e-6)
     assert np.all(sigmas[2][6:9] > 2.5 * sigmas[0][6:9])
+
+
+@pytest.mark.parametrize("ends_s", [[1.0, 2.0, 3.0], [0.5, 1.0, 1.5, 2.0, 2.5, 3.0], [None, 2.0, 3.0]])
+def test_a_silence_is_as_uncertain_in_pieces_as_at_once(ends_s: list[float | None]) -> None:
+    """Windows without samples, or None for one that never came: the unknown rate is the same one throughout."""
+    fuser = ImuOnlyFuser(gap_rate_sigma=0.2, gap_accel_sigma=1.0)
+    fuser.setup(make_rig(QUIET))
+    fuser.start_from(replace(state_at(0.0), v_world_body=np.zeros(3), covariance=1e-14 * np.eye(15)))
+    before = Frame(stamp_ns=0)
+    states: list[NavState] = []
+    for end_s in (0.001, *ends_s):
+        after = Frame(stamp_ns=NANOSECONDS if end_s is None else round(end_s * NANOSECONDS))
+        window = SyncedWindow(previous=before, current=after, imu=ImuBlock.none(), gap_ns=1)
+        states += [] if end_s is None else fuser.update(Measurement(window=window))
+        before = after
+    covariance = states[-1].covariance
+    assert covariance is not None
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)[:3]), 0.2 * 3.0, rtol=1e-3)
 
 
 def test_calls_out_of_order_are_refused() -> None:
