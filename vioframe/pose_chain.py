@@ -64,11 +64,6 @@ class PoseChain:
         """Where the chain ends, once it has begun."""
         return self._stamp_ns
 
-    @property
-    def age_s(self) -> float:
-        """Time since the middle of the last known motion."""
-        return self._age_s
-
     def begin(self, stamp_ns: int, given: NavState | None, imu: ImuBlock) -> None:
         """Take the first pose.
 

@@ -24,7 +24,7 @@ _LEAST_STEP = 0.2
 _MAX_TRUTH_GAP_NS = 110_000_000
 # Windows of which an image would lie where the truth is unknown stay as they are told after this many attempts.
 _ATTEMPTS = 3
-# Holes between samples up to this length are interpolated across, as synchronizer=sequential_cache does.
+# Holes between samples up to this length are interpolated across, as where windows go on without samples in use.
 _BRIDGED_S = 0.2
 
 

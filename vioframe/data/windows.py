@@ -182,8 +182,8 @@ def states_in_body(sequence: StoredSequence, stamps_ns: Stamps, T_world_cam: Arr
     """True velocity (K, 3) m/s and gravity (K, 3) m/s² in the body, at stamps and poses of the camera (K,…)."""
     truth = sequence.truth
     # Relative to the first before they become floats: absolute nanoseconds would lose digits.
-    at_s, known_s = stamps_ns - stamps_ns[0], truth.stamps_ns - stamps_ns[0]
-    v_world = np.stack([np.interp(at_s, known_s, axis) for axis in differentiate_positions(truth).T], axis=1)
+    at_ns, known_ns = stamps_ns - stamps_ns[0], truth.stamps_ns - stamps_ns[0]
+    v_world = np.stack([np.interp(at_ns, known_ns, axis) for axis in differentiate_positions(truth).T], axis=1)
     R_body_world = sequence.camera.T_body_cam[:3, :3] @ np.swapaxes(T_world_cam[:, :3, :3], 1, 2)
     return np.einsum("kij,kj->ki", R_body_world, v_world), -sequence.gravity * R_body_world[:, :, 2]
 

@@ -37,7 +37,7 @@ def trainer_options(config: DictConfig, choices: Mapping[str, str], *, answers: 
             raise ConfigError(f"{group}={choices.get(group, 'none')} does not say how to train: add {group}={example}")
     if answers:
         plain = OmegaConf.create({"trainer": OmegaConf.to_container(config.trainer, resolve=True)})
-        plain.trainer = OmegaConf.merge(plain.trainer, plain.trainer.fusion, {"fusion": {}})
+        plain.trainer = OmegaConf.merge(plain.trainer, plain.trainer.fusion)
         config = plain
     return build(config, "trainer", TrainerOptions, choices.get("trainer", ""))
 
