@@ -1,8 +1,9 @@
-"""The groups experiment= and training_data=kitti: KITTI as in the paper, without its leak."""
+"""The group experiment=: KITTI as in the papers, without the leak of one, and what is tested left out of training."""
 
 import pytest
 
 from composing import composed, offered
+from shared_data import shared_data
 from vioframe.build import build
 from vioframe.data.recording import Dataset
 from vioframe.data.windows import check_split
@@ -26,8 +27,33 @@ def numbers(dataset):
     return [name.partition(".")[0] for name in dataset.sequences]
 
 
+LEFT_OUT = {
+    "fusion_kitti": ("kitti", "dataset.root", "dataset.sequence", ("01", "02", "04", "06", "07", "08")),
+    "fusion_euroc": (
+        "euroc_imu_gt",
+        "dataset.source.root",
+        "dataset.source.sequence",
+        ("MH_01_easy", "MH_04_difficult", "V1_01_easy", "V1_02_medium", "V2_01_easy"),
+    ),
+}
+
+
 def test_every_experiment_is_known_here():
-    assert set(offered("experiment")) == set(SPLITS)
+    assert set(offered("experiment")) == {*SPLITS, *LEFT_OUT}
+
+
+@pytest.mark.parametrize("name", LEFT_OUT)
+def test_what_is_tested_is_neither_learned_from_nor_validated_with(name):
+    folder, root, key, sequences = LEFT_OUT[name]
+    place = shared_data(folder)
+    for tested in sequences:
+        config = composed(f"experiment={name}", f"{root}={place}", f"{key}=['{tested}']")
+        parts = {split: build(config, f"training_data.{split}", Dataset) for split in ("train", "validation")}
+        seen = {each.partition(".")[0] for part in parts.values() for each in part.sequences}
+        (own,) = build(config, "dataset", Dataset).sequences
+        assert own.partition(".")[0] not in seen
+        assert len(seen) == len(sequences) - 1
+        check_split(parts["train"].sequences, parts["validation"].sequences)
 
 
 @pytest.mark.parametrize("name", SPLITS)

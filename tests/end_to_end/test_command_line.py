@@ -36,7 +36,7 @@ def timed(cli, *arguments: str) -> tuple[float, subprocess.CompletedProcess]:
 @pytest.mark.parametrize(
     ("arguments", "status", "words"),
     [
-        (("--help",), 0, "fuser: ekf, imu_only, msckf, msf"),
+        (("--help",), 0, "fuser: ekf, ekf_vio, imu_only, lstm, msckf, msf"),
         (("fuser.no_such_option=1",), 1, "no_such_option"),
         (("fuser=no_such_fuser",), 1, "Available options in 'fuser'"),
         (("task=plugins",), 0, "vioframe_klt"),
