@@ -12,7 +12,7 @@ import numpy as np
 
 from vioframe.checks import Array, Stamps, check_not_negative
 from vioframe.conventions import NANOSECONDS
-from vioframe.data.windows import PairAnswers, StoredSequence, TrainingWindow, samples_between, states_in_body
+from vioframe.data.windows import PairAnswers, StoredSequence, TrainingWindow, make_window, samples_between
 from vioframe.errors import ConfigError
 from vioframe.geometry import se3
 from vioframe.geometry.interpolation import interpolate_poses
@@ -128,23 +128,9 @@ class Desynchronisation:
         recording: int,
         rng: np.random.Generator,
     ) -> TrainingWindow:
-        samples, times = self._samples(sequence.imu, stamps, rng)
-        velocity, gravity = states_in_body(sequence, stamps, T_world_cam)
-        return TrainingWindow(
-            images=np.array(sequence.images[numbers]),
-            stamps_ns=stamps,
-            T_prev_cur=se3.inverse(T_world_cam[:-1]) @ T_world_cam[1:],
-            imu=samples,
-            imu_time_s=times,
-            intrinsics_px=sequence.camera.intrinsics_px,
-            T_body_cam=sequence.camera.T_body_cam,
-            gravity=sequence.gravity,
-            velocity_body=velocity,
-            gravity_body=gravity,
-            vo=None if sequence.vo is None else joined_answers(sequence.vo, numbers),
-            recording=recording,
-            start=int(numbers[0]),
-        )
+        answers = None if sequence.vo is None else joined_answers(sequence.vo, numbers)
+        inertial = self._samples(sequence.imu, stamps, rng)
+        return make_window(sequence, numbers, stamps, T_world_cam, inertial, answers, recording)
 
     def _samples(
         self, imu: ImuBlock | None, stamps: Stamps, rng: np.random.Generator

@@ -159,12 +159,44 @@ def cut_window(sequence: StoredSequence, start: int, pairs: int, recording: int 
     stop = start + pairs + 1
     stamps = sequence.stamps_ns[start:stop].astype(np.int64)
     poses = sequence.T_world_cam[start:stop]
-    samples, times = samples_between(sequence.imu, stamps)
-    velocity, gravity = states_in_body(sequence, stamps, poses)
+    answers = None if sequence.vo is None else sequence.vo.cut(start, stop - 1)
+    return make_window(
+        sequence,
+        np.arange(start, stop),
+        stamps,
+        poses,
+        samples_between(sequence.imu, stamps),
+        answers,
+        recording,
+    )
+
+
+def make_window(
+    sequence: StoredSequence,
+    numbers: Stamps,
+    stamps_ns: Stamps,
+    T_world_cam: Array,
+    inertial: tuple[tuple[Array, ...], tuple[Array, ...]],
+    vo: PairAnswers | None,
+    recording: int,
+) -> TrainingWindow:
+    """A window of given images, with the truth that goes with the stamps it is told.
+
+    Args:
+        sequence: that it is cut from.
+        numbers: (S + 1,) of its images.
+        stamps_ns: (S + 1,) IMU clock, which may differ from those of the images.
+        T_world_cam: (S + 1, 4, 4) true poses of camera 0 at these stamps.
+        inertial: samples and their times of each pair, as :func:`samples_between` returns them.
+        vo: what was answered for its pairs, or None.
+        recording: number of the recording in the split.
+    """
+    samples, times = inertial
+    velocity, gravity = states_in_body(sequence, stamps_ns, T_world_cam)
     return TrainingWindow(
-        images=np.array(sequence.images[start:stop]),
-        stamps_ns=stamps,
-        T_prev_cur=se3.inverse(poses[:-1]) @ poses[1:],
+        images=np.array(sequence.images[numbers]),
+        stamps_ns=stamps_ns,
+        T_prev_cur=se3.inverse(T_world_cam[:-1]) @ T_world_cam[1:],
         imu=samples,
         imu_time_s=times,
         intrinsics_px=sequence.camera.intrinsics_px,
@@ -172,9 +204,9 @@ def cut_window(sequence: StoredSequence, start: int, pairs: int, recording: int 
         gravity=sequence.gravity,
         velocity_body=velocity,
         gravity_body=gravity,
-        vo=None if sequence.vo is None else sequence.vo.cut(start, stop - 1),
+        vo=vo,
         recording=recording,
-        start=start,
+        start=int(numbers[0]),
     )
 
 
