@@ -25,6 +25,16 @@ ROWS = {
     "imu_only": ["fuser=imu_only"],
     "ekf": ["fuser=ekf"],
     "msf": ["fuser=msf"],
+    # EE-LCVIO's net as the paper has it, at the trainer's width, and the same net as a correction of the odometry.
+    "lstm_paper": [
+        "fuser=lstm",
+        "fuser.head=pose",
+        "fuser.pose.pose=absolute",
+        "fuser.pose.refines=false",
+        "fuser.pose.activation=relu",
+        "fuser.pose.translation_unit=1",
+        "fuser.pose.rotation_unit=1",
+    ],
     "lstm_pose": ["fuser=lstm", "fuser.head=pose"],
     "lstm": ["fuser=lstm", "fuser.head=residual"],
     "ekf_vio": ["fuser=ekf_vio"],
