@@ -7,9 +7,12 @@ from vioframe.pictures.homographies import (
     warp_picture,
     warp_points,
 )
+from vioframe.pictures.lighting import LightingOptions, change_light
 
 __all__ = [
     "HomographyOptions",
+    "LightingOptions",
+    "change_light",
     "sample_homography",
     "valid_mask",
     "warp_picture",

@@ -157,8 +157,8 @@ def valid_mask(
 ) -> Mask:
     """Where the warped picture (H, W) shows the picture, at least ``border`` px from where the picture ends.
 
-    The frame of the warped picture takes nothing away, where the picture goes on beyond it. For the mask of the picture, where the warped one covers
-    it, give the inverse of H.
+    The frame of the warped picture takes nothing away where the picture goes on beyond it. For the mask of the picture,
+    where the warped one covers it, give the inverse of H.
 
     Args:
         H: (3, 3), pixels of the picture to pixels of the warped one.
