@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import asdict
 from html import escape
@@ -9,7 +10,9 @@ from pathlib import Path
 
 from vioframe import __version__
 from vioframe.evaluation.page import image_tag, render_page
+from vioframe.evaluation.paired import PairedComparison, show_p, show_ratio
 from vioframe.study.figure import draw_study
+from vioframe.study.plan import Value
 from vioframe.study.summary import StudySummary
 from vioframe.sweep.summary import Column
 
@@ -30,10 +33,17 @@ def write_study(summary: StudySummary, folder: Path, config_yaml: str) -> list[P
     entries = [{**asdict(cell), **asdict(result)} for cell, result in summary.results.items()]
     content = {
         "study": summary.study.name,
-        "key": summary.study.key,
+        "key": summary.study.varied,
         "vioframe": __version__,
         "variants": {name: summary.study.variants[name] for name in summary.study.chosen},
+        "conditions": summary.study.conditions,
         "sentences": summary.sentences(),
+        "baseline": summary.study.baseline,
+        "comparisons": [
+            {"variant": variant, "metric": column.key, "at": where, **_plain(compared)}
+            for column in summary.columns
+            for variant, where, compared in summary.comparisons(column)
+        ],
         "cells": entries,
     }
     document.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -44,10 +54,11 @@ def make_page(summary: StudySummary, figure: Path, config_yaml: str) -> str:
     """The page as HTML; the figure is inside it."""
     study = summary.study
     seeds = ", ".join(map(str, study.seeds))
+    on = f"{', '.join(study.recordings)} · " if study.recordings else ""
     body = [
         f"<h1>{escape(study.title)}</h1>",
-        f"<p class=parts><code>{escape(study.key)}</code> · seeds {seeds} · {len(summary.results)} runs · "
-        f"vioframe {escape(__version__)}</p>",
+        f"<p class=parts><code>{escape(study.varied)}</code> · {escape(on)}seeds {seeds} · "
+        f"{len(summary.results)} runs · vioframe {escape(__version__)}</p>",
     ]
     for error, cells in summary.failures().items():
         told = ", ".join(str(cell) for cell in cells)
@@ -56,6 +67,7 @@ def make_page(summary: StudySummary, figure: Path, config_yaml: str) -> str:
     body.append("<ul>" + "".join(f"<li>{escape(sentence)}</li>" for sentence in summary.sentences()) + "</ul>")
     for column in summary.columns:
         body += _section(summary, column)
+        body += _comparisons(summary, column)
     variants = "".join(
         f"<tr><td class=name>{escape(name)}</td><td class=text><code>{escape(' '.join(study.variants[name]))}</code>"
         "</td></tr>"
@@ -63,6 +75,13 @@ def make_page(summary: StudySummary, figure: Path, config_yaml: str) -> str:
     )
     common = escape(" ".join(study.base))
     body.append(f"<h2>Variants</h2><p>All: <code>{common}</code></p><table>{variants}</table>")
+    if study.conditions:
+        conditions = "".join(
+            f"<tr><td class=name>{escape(study.shown(name))}</td>"
+            f"<td class=text><code>{escape(' '.join(study.conditions[str(name)]))}</code></td></tr>"
+            for name in study.all_values()
+        )
+        body.append(f"<h2>Conditions</h2><table>{conditions}</table>")
     body.append(f"<h2>Configuration</h2><details><summary>resolved</summary><pre>{escape(config_yaml)}</pre></details>")
     return render_page(f"vioframe: {study.title}", body)
 
@@ -70,7 +89,7 @@ def make_page(summary: StudySummary, figure: Path, config_yaml: str) -> str:
 def _section(summary: StudySummary, column: Column) -> Iterator[str]:
     study = summary.study
     yield f"<h2>{escape(column.title)}</h2>"
-    heads = "".join(f"<th>{study.shown(value)}</th>" for value in study.all_values())
+    heads = "".join(f"<th>{escape(study.shown(value))}</th>" for value in study.all_values())
     rows = []
     for variant in study.chosen:
         cells = "".join(_cell(summary, variant, value, column) for value in study.all_values())
@@ -80,11 +99,37 @@ def _section(summary: StudySummary, column: Column) -> Iterator[str]:
         f"<tbody>{''.join(rows)}</tbody></table></div>"
     )
     percent = f"{100.0 * study.tolerance:g} %"
-    yield f"<p class=note>Median over seeds, range below; change against {study.shown(study.reference)}, "
-    yield f"bold where more than {percent} is lost.</p>"
+    over = "recordings and seeds" if study.recordings else "seeds"
+    yield f"<p class=note>Median over {over}, range below; change against {escape(study.shown(study.reference))}, "
+    yield f"bold where more than {percent} is lost."
+    if study.least_completion > 0.0 and column.key != "completion":
+        yield f" A run that tracks less than {100.0 * study.least_completion:g} % of its recording failed."
+    yield "</p>"
 
 
-def _cell(summary: StudySummary, variant: str, value: float, column: Column) -> str:
+def _comparisons(summary: StudySummary, column: Column) -> Iterator[str]:
+    found = summary.comparisons(column)
+    if not found:
+        return
+    yield f"<h3>Beside {escape(str(summary.study.baseline))}</h3>"
+    yield "<div class=scroll><table><thead><tr><th class=name>variant</th><th class=name>at</th>"
+    yield "<th>ratio of medians</th><th>better</th><th>worse</th><th>pairs</th><th>p</th></tr></thead><tbody>"
+    for variant, where, compared in found:
+        numbers = (show_ratio(compared), compared.better, compared.worse, compared.pairs, show_p(compared.p_value))
+        cells = "".join(f"<td>{escape(str(number))}</td>" for number in numbers)
+        yield f"<tr><td class=name>{escape(variant)}</td><td class=name>{escape(where)}</td>{cells}</tr>"
+    yield "</tbody></table></div><p class=note>Pairs: runs of the same recording, seed and condition. In brackets the "
+    yield "95 % interval, from pairs drawn with replacement. p: Wilcoxon’s signed-rank test of the logarithms, "
+    yield "two-sided, each by itself, without a correction for how many there are.</p>"
+
+
+def _plain(compared: PairedComparison) -> dict[str, object]:
+    """JSON knows no infinity."""
+    numbers = asdict(compared)
+    return {name: None if number == math.inf else number for name, number in numbers.items()}
+
+
+def _cell(summary: StudySummary, variant: str, value: Value, column: Column) -> str:
     spread = summary.spread(variant, value, column)
     if spread is None:
         reasons = {
@@ -94,11 +139,14 @@ def _cell(summary: StudySummary, variant: str, value: float, column: Column) -> 
         }
         told = "; ".join(sorted(reason for reason in reasons if reason))
         return f"<td><span class=undefined title='{escape(told, quote=True)}'>undefined</span></td>"
-    text = f"{spread.median:.{column.decimals}f}"
+    text = spread.text(spread.median, column.decimals)
     if spread.high > spread.low:
-        text += f"<br><small>{spread.low:.{column.decimals}f}…{spread.high:.{column.decimals}f}</small>"
+        low, high = (spread.text(number, column.decimals) for number in (spread.low, spread.high))
+        text += f"<br><small>{low}…{high}</small>"
+    if spread.failed:
+        text += f"<br><small>{spread.failed} of {spread.runs} failed</small>"
     loss = summary.loss(variant, value, column)
-    if loss is not None and value != summary.study.reference:
+    if loss is not None and math.isfinite(loss) and value != summary.study.reference:
         change = f"{loss:+.0%}"
         text += f"<br><small>{f'<b>{change}</b>' if loss > summary.study.tolerance else change}</small>"
     return f"<td>{text}</td>"
@@ -108,7 +156,9 @@ def _write_csv(summary: StudySummary, path: Path) -> None:
     names = sorted({name for result in summary.results.values() for name in result.metrics})
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(["variant", summary.study.key, "seed", "status", "error", *names])
+        recorded = ["recording"] if summary.study.recordings else []
+        writer.writerow(["variant", summary.study.varied, *recorded, "seed", "status", "error", *names])
         for cell, result in summary.results.items():
             numbers = (repr(result.metrics[name]) if name in result.metrics else "" for name in names)
-            writer.writerow([cell.variant, cell.value, cell.seed, result.status, result.error, *numbers])
+            run = cell.run if recorded else cell.run[1:]
+            writer.writerow([cell.variant, cell.value, *run, result.status, result.error, *numbers])

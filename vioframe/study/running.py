@@ -8,11 +8,12 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from vioframe.composing import Composed, Composer
 from vioframe.errors import ConfigError, VioframeError
 from vioframe.study.cells import CellResult, CellStore, cell_key, failed, run_cell
-from vioframe.study.plan import Cell, Study
+from vioframe.study.plan import Cell, Study, Value
 from vioframe.study.weights import lend, weights_of
 
 log = logging.getLogger(__name__)
@@ -37,7 +38,7 @@ class StudyRun:
         self._composer = composer
         self._shown = shown
         self._store = CellStore(Path(study.cells_folder).expanduser())
-        self._composed: dict[str, Composed] = {}
+        self._composed: dict[tuple[str, Value], Composed] = {}
         self._weights: dict[tuple[str, int | None], dict[str, str]] = {}
         self.told: set[str] = set()
         self._broken: dict[tuple[str, int | None], VioframeError] = {}
@@ -50,17 +51,14 @@ class StudyRun:
         """
         seeds: list[int | None] = list(self._study.seeds) if self._study.training_seed_keys else [None]
         for variant in self._study.chosen:
-            study = self._study
-            # Of two that set the same, the later counts.
-            overrides = [*study.base, *self._given, *study.variants[variant], *study.more]
             try:
-                composed = self._composer.compose(overrides)
+                composed = self._compose(variant)
                 self._check(composed.config, variant)
             except VioframeError as error:
                 for seed in seeds:
                     self._break(variant, seed, error)
                 continue
-            self._composed[variant] = composed
+            self._composed[variant, ""] = composed
             for seed in seeds:
                 config = copy.deepcopy(composed.config)
                 if seed is not None:
@@ -74,14 +72,16 @@ class StudyRun:
 
     def results(self) -> Iterator[tuple[Cell, CellResult]]:
         """Every cell as it ends, those that are there first."""
-        waiting: list[tuple[Cell, DictConfig, str]] = []
+        waiting: list[tuple[Cell, Composed, str]] = []
         for cell in self._study.cells():
             trained = cell.variant, cell.seed if self._study.training_seed_keys else None
             if trained in self._broken:
                 yield cell, failed(self._broken[trained])
                 continue
             try:
-                config = self._config_of(cell, self._weights[trained])
+                composed = self._compose_cell(cell)
+                config = composed.config
+                lend(config, self._weights[trained])
                 key = cell_key(config)
             except VioframeError as error:
                 yield cell, failed(error)
@@ -90,25 +90,30 @@ class StudyRun:
             if found is not None:
                 yield cell, found
             else:
-                waiting.append((cell, config, key))
+                waiting.append((cell, composed, key))
         for cell, result in self._run(waiting):
             self._store.keep(
                 result,
-                {"study": self._study.name, "variant": cell.variant, self._study.key: cell.value, "seed": cell.seed},
+                {
+                    "study": self._study.name,
+                    "variant": cell.variant,
+                    self._study.varied: cell.value,
+                    "recording": cell.recording,
+                    "seed": cell.seed,
+                },
             )
             yield cell, result
 
-    def _run(self, waiting: list[tuple[Cell, DictConfig, str]]) -> Iterator[tuple[Cell, CellResult]]:
+    def _run(self, waiting: list[tuple[Cell, Composed, str]]) -> Iterator[tuple[Cell, CellResult]]:
         if self._study.workers == 1 or len(waiting) < 2:
-            for cell, config, key in waiting:
-                yield cell, run_cell(config, self._composed[cell.variant].choices, key)
+            for cell, composed, key in waiting:
+                yield cell, run_cell(composed.config, composed.choices, key)
             return
         # Fresh processes: a fork would copy the threads of libraries that do not expect it.
         pool = ProcessPoolExecutor(min(self._study.workers, len(waiting)), mp_context=get_context("spawn"))
         try:
             started = {
-                pool.submit(run_cell, config, self._composed[cell.variant].choices, key): cell
-                for cell, config, key in waiting
+                pool.submit(run_cell, composed.config, composed.choices, key): cell for cell, composed, key in waiting
             }
             for future in as_completed(started):
                 error = future.exception()
@@ -116,14 +121,26 @@ class StudyRun:
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
-    def _config_of(self, cell: Cell, weights: dict[str, str]) -> DictConfig:
-        config = copy.deepcopy(self._composed[cell.variant].config)
-        before = OmegaConf.select(config, self._study.key)
-        whole = isinstance(before, int) and not isinstance(before, bool) and cell.value.is_integer()
-        OmegaConf.update(config, self._study.key, int(cell.value) if whole else cell.value)
-        set_where_known(config, self._study.seed_keys, cell.seed)
-        lend(config, weights)
-        return config
+    def _compose(self, variant: str, condition: Sequence[str] = ()) -> Composed:
+        study = self._study
+        # Of two that set the same, the later counts.
+        return self._composer.compose([*study.base, *self._given, *study.variants[variant], *condition, *study.more])
+
+    def _compose_cell(self, cell: Cell) -> Composed:
+        """Its own copy, without the weights."""
+        study, place = self._study, (cell.variant, cell.value if self._study.conditions else "")
+        if place not in self._composed:
+            self._composed[place] = self._compose(cell.variant, study.conditions.get(str(cell.value), ()))
+        known = self._composed[place]
+        config = copy.deepcopy(known.config)
+        if not isinstance(cell.value, str):
+            before = OmegaConf.select(config, study.key)
+            whole = isinstance(before, int) and not isinstance(before, bool) and cell.value.is_integer()
+            OmegaConf.update(config, study.key, int(cell.value) if whole else cell.value)
+        if cell.recording:
+            OmegaConf.update(config, study.recording_key, cell.recording)
+        set_where_known(config, study.seed_keys, cell.seed)
+        return Composed(config=config, choices=known.choices)
 
     def _break(self, variant: str, seed: int | None, error: VioframeError) -> None:
         self._broken[variant, seed] = error
@@ -133,10 +150,19 @@ class StudyRun:
             self.told.add(sentence)
 
     def _check(self, config: DictConfig, variant: str) -> None:
-        value = OmegaConf.select(config, self._study.key)
-        if not isinstance(value, int | float):
+        study = self._study
+        try:
+            if study.recordings:
+                group, _, option = study.recording_key.rpartition(".")
+                node = OmegaConf.select(config, group) if group else config
+                if not (isinstance(node, DictConfig) and option in node):
+                    raise ConfigError(f"study.recording_key={study.recording_key} is no option of variant {variant}")
+            value = OmegaConf.select(config, study.key) if study.key else None
+        except OmegaConfBaseException as error:
+            raise ConfigError(f"variant {variant}: {str(error).strip().splitlines()[0]}") from error
+        if study.key and not isinstance(value, int | float):
             raise ConfigError(
-                f"study.key={self._study.key} must be an option with a number, but with variant {variant} it is {value}"
+                f"study.key={study.key} must be an option with a number, but with variant {variant} it is {value}"
             )
 
 

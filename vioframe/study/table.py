@@ -1,7 +1,9 @@
-"""A study in the terminal: one table of the metric that decides, and a sentence a variant."""
+"""A study in the terminal: one table of the metric that decides, variants beside the baseline, and sentences."""
 
+import math
 from typing import TYPE_CHECKING
 
+from vioframe.evaluation.paired import show_p, show_ratio
 from vioframe.study.summary import StudySummary
 
 if TYPE_CHECKING:
@@ -20,9 +22,8 @@ def print_study(summary: StudySummary, console: "Console | None" = None) -> None
             # A log file has no width; 80 columns would fold every row.
             console = Console(width=160)
     study, column = summary.study, summary.columns[0]
-    seeds = f"median of {len(study.seeds)} seeds" if len(study.seeds) > 1 else f"seed {study.seeds[0]}"
     # Units stand in brackets, which rich would take for its own.
-    table = Table(title=Text(f"{study.title}: {column.title}, {seeds}"), title_justify="left")
+    table = Table(title=Text(f"{study.title}: {column.title}, {summary.runs_told()}"), title_justify="left")
     table.add_column(Text(study.axis), overflow="fold")
     for value in study.all_values():
         table.add_column(study.shown(value), justify="right")
@@ -33,13 +34,36 @@ def print_study(summary: StudySummary, console: "Console | None" = None) -> None
             if spread is None:
                 cells.append(Text("–", style="dim"))
                 continue
-            within = loss is not None and loss <= study.tolerance
-            cells.append(Text(f"{spread.median:.{column.decimals}f}", style="green" if within else ""))
+            within = loss is not None and loss <= study.tolerance and math.isfinite(spread.median)
+            text = spread.text(spread.median, column.decimals)
+            if spread.failed:
+                text += f" ({spread.failed} of {spread.runs} failed)"
+            cells.append(Text(text, style="green" if within else ""))
         table.add_row(Text(variant), *cells)
     console.print(table)
+    _print_comparisons(summary, console)
     for sentence in summary.sentences():
         console.print(sentence, markup=False, highlight=False)
     for error, cells_failed in summary.failures().items():
         told = ", ".join(str(cell) for cell in cells_failed[:4])
         more = f" and {len(cells_failed) - 4} more" if len(cells_failed) > 4 else ""
         console.print(f"failed: {told}{more}: {error}", style="red", markup=False, highlight=False)
+
+
+def _print_comparisons(summary: StudySummary, console: "Console") -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    column = summary.columns[0]
+    found = summary.comparisons(column)
+    if not found:
+        return
+    title = f"{column.title}, beside {summary.study.baseline}, pairs of the same recording and seed"
+    table = Table(title=Text(title), title_justify="left")
+    for head in ("variant", "at", "ratio of medians (95 %)", "better", "worse", "pairs", "p"):
+        table.add_column(head, justify="left" if head in ("variant", "at") else "right")
+    for variant, where, compared in found:
+        counts = (compared.better, compared.worse, compared.pairs)
+        table.add_row(variant, where, show_ratio(compared), *map(str, counts), show_p(compared.p_value))
+    console.print(table)
+    console.print("p: Wilcoxon's signed-rank test, two-sided, each by itself", style="dim", highlight=False)

@@ -12,7 +12,7 @@ from vioframe.sweep.summary import Column, Summary, is_seed, override_key
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_COLOURS = ("#1f6fb4", "#e0812f", "#1b7f4b", "#8a4fbf", "#c8323c", "#6b5b3e", "#d16ba5", "#5a5a5a")
+COLOURS = ("#1f6fb4", "#e0812f", "#1b7f4b", "#8a4fbf", "#c8323c", "#6b5b3e", "#d16ba5", "#5a5a5a")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 # Fewer numbers than this make no line, unless lines can be compared.
 _FEWEST_ALONE = 3
@@ -49,7 +49,7 @@ def find_curves(summary: Summary) -> Curves | None:
             return None
         lines.setdefault(label, {}).setdefault(value, []).append(job)
     numbers = {number for line in lines.values() for number in line}
-    if len(numbers) < (2 if others else _FEWEST_ALONE) or len(lines) > len(_COLOURS):
+    if len(numbers) < (2 if others else _FEWEST_ALONE) or len(lines) > len(COLOURS):
         return None
     return Curves(key=numeric[0], lines={label: dict(sorted(line.items())) for label, line in lines.items()})
 
@@ -105,7 +105,7 @@ def draw_panel(axes: "Axes", column: Column, curves: Curves) -> None:
     numbers = sorted({number for line in curves.lines.values() for number in line})
     drawn: list[float] = []
     for place, (label, line) in enumerate(curves.lines.items()):
-        colour, marker = _COLOURS[place % len(_COLOURS)], _MARKERS[place % len(_MARKERS)]
+        colour, marker = COLOURS[place % len(COLOURS)], _MARKERS[place % len(_MARKERS)]
         known = {number: sorted(_values(jobs, column)) for number, jobs in line.items() if _is_known(jobs, column)}
         drawn += [value for each in known.values() for value in each]
         x = list(known)

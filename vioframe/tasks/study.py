@@ -116,7 +116,13 @@ def _record(config: DictConfig, tracker: Tracker, study: Study, cell: Cell, resu
     nested.tracker.run_name = None
     child = build(nested, "tracker", Tracker)
     child.start(
-        {"variant": cell.variant, study.key: cell.value, "seed": cell.seed, "cell": result.key},
+        {
+            "variant": cell.variant,
+            study.varied: cell.value,
+            "recording": cell.recording or None,
+            "seed": cell.seed,
+            "cell": result.key,
+        },
         {"vioframe.kind": "cell", "vioframe.stored": str(result.stored).lower()},
         name=str(cell),
     )
