@@ -3,6 +3,7 @@
     python benchmarks/fusion.py kitti --root DATA/kitti                    leave-one-out table on real inertial samples
     python benchmarks/fusion.py kitti --root DATA/kitti --rows ekf lstm --sequences 07 --seeds 0
     python benchmarks/fusion.py euroc --root DATA/euroc_imu_gt             the same on EuRoC, odometry on replays
+    python benchmarks/fusion.py euroc_drawn --root DATA/euroc_imu_gt       the same with drawn errors of odometry
     python benchmarks/fusion.py sensor_loss                                1 s and 5 s without camera, without IMU
     python benchmarks/fusion.py anees                                      ANEES on simulated drives nobody learned from
     python benchmarks/fusion.py latency                                    ms a frame of each fuser, one thread
@@ -22,7 +23,14 @@ from playing import use_one_thread
 
 FIGURES = {
     figure.__name__: figure
-    for figure in (figures.kitti, figures.euroc, figures.sensor_loss, figures.anees, figures.latency)
+    for figure in (
+        figures.kitti,
+        figures.euroc,
+        figures.euroc_drawn,
+        figures.sensor_loss,
+        figures.anees,
+        figures.latency,
+    )
 }
 
 

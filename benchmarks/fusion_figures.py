@@ -15,7 +15,7 @@ from vioframe.geometry.interpolation import interpolate_poses
 from vioframe.study.cells import CellResult
 from vioframe.types import Measurement, NavState
 
-__all__ = ["ROWS", "Options", "anees", "euroc", "kitti", "latency", "sensor_loss"]
+__all__ = ["ROWS", "Options", "anees", "euroc", "euroc_drawn", "kitti", "latency", "sensor_loss"]
 
 KITTI = ("01", "02", "04", "06", "07", "08")
 EUROC = ("V1_01_easy", "V1_02_medium", "V2_01_easy", "MH_01_easy", "MH_04_difficult")
@@ -58,17 +58,23 @@ def kitti(options: Options) -> Numbers:
 
 
 def euroc(options: Options) -> Numbers:
-    """Leave-one-out on replays of EuRoC: real inertial samples, odometry on rendered images."""
+    """Leave-one-out on replays of EuRoC: real inertial samples, stereo odometry on rendered images."""
+    return _euroc(options, ["rig=stereo", "vo=stereo"], ["dataset.seed"])
 
+
+def euroc_drawn(options: Options) -> Numbers:
+    """The same with an odometry that errs as much as a learned one, drawn; no image is rendered."""
+    return _euroc(options, ["rig=blind", "frontend=none", "vo=error_model"], ["vo.seed"])
+
+
+def _euroc(options: Options, odometry: Sequence[str], seeds: Sequence[str]) -> Numbers:
     def overrides(sequence: str, seed: int) -> list[str]:
         return [
             "experiment=fusion_euroc",
             f"dataset.source.root={options.folder()}",
             f"dataset.source.sequence=[{sequence}]",
-            "vo=stereo",
-            "rig=stereo",
-            f"dataset.seed={seed}",
-            f"trainer.seed={seed}",
+            *odometry,
+            *(f"{name}={seed}" for name in (*seeds, "trainer.seed")),
         ]
 
     return _leave_one_out(options, EUROC, overrides, ("ate_se3_m", "rpe_trans_percent_10m", "rpe_rot_deg_10m"))
@@ -120,7 +126,7 @@ def _cell(values: Sequence[float | None]) -> str:
     known = [value for value in values if value is not None]
     if len(known) < len(values):
         return "undefined"
-    return f"{median(known):.2f}" + (f" ({min(known):.2f}…{max(known):.2f})" if len(known) > 1 else "")
+    return f"{median(known):.3g}" + (f" ({min(known):.3g}…{max(known):.3g})" if len(known) > 1 else "")
 
 
 def show(lines: Sequence[Sequence[str]]) -> None:
