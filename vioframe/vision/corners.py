@@ -63,7 +63,7 @@ class CornerDetector:
             count=count,
         )
         points = points[chosen]
-        refined = _refine(strength, points)
+        refined = refine_peaks(strength, points)
         # The centre of pixel x of the half-size image lies at 2x + 0.5 of the full one.
         return refined * scale + 0.5 * (scale - 1), strength[points[:, 1], points[:, 0]].astype(float)
 
@@ -79,8 +79,8 @@ class CornerDetector:
         return free
 
 
-def _refine(strength: np.ndarray, points: np.ndarray) -> Array:
-    """Sub-pixel maximum (K, 2) of a parabola through each corner and its neighbours."""
+def refine_peaks(strength: np.ndarray, points: np.ndarray) -> Array:
+    """Sub-pixel maximum (K, 2) of a parabola through ``strength`` (H, W) at each pixel (K, 2) and its neighbours."""
     height, width = strength.shape
     column = np.clip(points[:, 0], 1, width - 2)
     row = np.clip(points[:, 1], 1, height - 2)
@@ -95,3 +95,21 @@ def _refine(strength: np.ndarray, points: np.ndarray) -> Array:
     x = column + shift(strength[row, column - 1].astype(float), strength[row, column + 1].astype(float))
     y = row + shift(strength[row - 1, column].astype(float), strength[row + 1, column].astype(float))
     return np.stack([x, y], axis=-1)
+
+
+def place_corners(gray: np.ndarray, pixels: Array, half_side: int) -> Array:
+    """Corners (M, 2) px moved to where the gradients around them meet; one that would leave its window stays.
+
+    Args:
+        gray: (H, W) uint8.
+        pixels: (M, 2) px.
+        half_side: of the window, px; 0 moves nothing.
+    """
+    if half_side == 0 or len(pixels) == 0:
+        return pixels
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.01)
+    start = np.ascontiguousarray(pixels, np.float32)
+    placed = cv2.cornerSubPix(gray, start, (half_side, half_side), (-1, -1), criteria).reshape(-1, 2)
+    near = np.linalg.norm(placed - pixels, axis=-1) < half_side
+    refined: Array = np.where(near[:, None], placed, pixels).astype(float)
+    return refined

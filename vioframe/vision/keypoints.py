@@ -1,7 +1,7 @@
 """Points of one image with what describes their surroundings."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -17,7 +17,8 @@ class Keypoints:
     Attributes:
         pixels: (M, 2) px.
         scores: (M,) larger is better.
-        descriptors: (M, D): uint8 are bits, compared by Hamming distance; floats by the norm of their difference.
+        descriptors: (M, D): uint8 are bits, compared by Hamming distance; floats by the norm of their difference. D is
+            0 where an extractor describes nothing.
     """
 
     pixels: Array
@@ -40,6 +41,7 @@ class Keypoints:
         return Keypoints(pixels=self.pixels[keep], scores=self.scores[keep], descriptors=self.descriptors[keep])
 
 
+@runtime_checkable
 class Extractor(Protocol):
     """Finds keypoints in an image; knows nothing of other images."""
 

@@ -71,3 +71,28 @@ def _clearly_nearest(group: np.ndarray, distance: Array, ratio: float) -> np.nda
     second[same] = distance[order[first[same] + 1]]
     clear: np.ndarray = order[first[nearest <= ratio * second]]
     return clear
+
+
+def all_distances(first: np.ndarray, second: np.ndarray) -> Array:
+    """Distances (M, K) of all pairs of descriptors (M, D) and (K, D): bits that differ for uint8, Euclidean otherwise.
+
+    In double precision, where the difference of nearly equal vectors still is one.
+    """
+    bits = first.dtype == np.uint8
+    a, b = (np.unpackbits(d, axis=1).astype(np.float32) if bits else d.astype(float) for d in (first, second))
+    squared: Array = np.sum(a * a, axis=1)[:, None] + np.sum(b * b, axis=1) - 2.0 * (a @ b.T)
+    # Zeros and ones differ by their squared distance; their sums are whole numbers.
+    return squared.astype(float) if bits else np.sqrt(np.maximum(squared, 0.0))
+
+
+def mutual_nearest(distance: Array, max_distance: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (N,) ascending and columns (N,) that are each other's nearest in ``distance`` (M, K)."""
+    if 0 in distance.shape:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    nearest = distance.argmin(axis=1)
+    rows = np.flatnonzero(distance.argmin(axis=0)[nearest] == np.arange(len(distance)))
+    columns = nearest[rows]
+    if max_distance is not None:
+        near = distance[rows, columns] <= max_distance
+        rows, columns = rows[near], columns[near]
+    return rows, columns

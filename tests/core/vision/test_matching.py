@@ -9,7 +9,7 @@ from vioframe.geometry import so3
 from vioframe.types import Camera
 from vioframe.vision.keeper import KeeperOptions, TrackKeeper
 from vioframe.vision.keypoints import Keypoints
-from vioframe.vision.matching import descriptor_distances, match, pairs_near
+from vioframe.vision.matching import all_distances, descriptor_distances, match, mutual_nearest, pairs_near
 from vioframe.vision.spread import choose_spread, crowded
 
 CAMERA = Camera(
@@ -32,6 +32,27 @@ def test_distances_are_those_of_bits_and_of_vectors():
     bits = np.array([[0b1010, 255], [0, 0]], np.uint8)
     assert descriptor_distances(bits, bits[::-1]).tolist() == [10.0, 10.0]
     assert np.allclose(descriptor_distances(np.array([[3.0, 0.0]]), np.array([[0.0, 4.0]])), 5.0)
+
+
+def test_all_distances_are_those_of_each_pair():
+    rng = np.random.default_rng(5)
+    for first, second in (
+        (rng.integers(0, 256, (7, 32), dtype=np.uint8), rng.integers(0, 256, (9, 32), dtype=np.uint8)),
+        (rng.normal(size=(7, 64)).astype(np.float32), rng.normal(size=(9, 64)).astype(np.float32)),
+    ):
+        expected = [[descriptor_distances(a[None], b[None])[0] for b in second] for a in first]
+        assert np.allclose(all_distances(first, second), expected, atol=1e-5)
+        assert np.allclose(np.diag(all_distances(first, first)), 0.0, atol=1e-6)
+        assert all_distances(first[:0], second).shape == (0, 9)
+
+
+def test_mutual_neighbours_prefer_each_other():
+    distance = np.array([[0.1, 0.5, 0.9], [0.2, 0.6, 0.3], [0.8, 0.7, 0.75]])
+    # Row 1 prefers column 0, which prefers row 0; column 1 prefers row 0; row 2 prefers column 1.
+    rows, columns = mutual_nearest(distance)
+    assert (rows.tolist(), columns.tolist()) == ([0], [0])
+    assert len(mutual_nearest(distance, 0.05)[0]) == 0
+    assert len(mutual_nearest(distance[:0])[0]) == len(mutual_nearest(distance[:, :0])[0]) == 0
 
 
 def test_matches_are_mutual_and_clear():

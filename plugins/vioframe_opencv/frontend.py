@@ -1,0 +1,114 @@
+"""``frontend=sift``: SIFT's keypoints matched by their descriptors, with lasting ids."""
+
+from vioframe.checks import check_positive
+from vioframe.errors import ConfigError
+from vioframe.vision.descriptor_frontend import DescriptorFrontend
+from vioframe.vision.keeper import KeeperOptions
+from vioframe_opencv.sift import SiftExtractor
+
+
+class SiftFrontend(DescriptorFrontend):
+    """Extrema of a scale space (Lowe 2004), matched near where the gyro puts them.
+
+    Args:
+        stereo: also match with camera 1.
+        min_depth: nearer points are not matched there, m.
+        max_points: most points that have an id at once.
+        min_distance_px: of a new point from all others.
+        keypoints: most found an image, with or without an id.
+        spacing_px: least distance between two of them.
+        contrast: least contrast of an extremum, relative to the range of grey levels.
+        edge: largest ratio of the principal curvatures of an extremum.
+        layers: of an octave.
+        sigma: blur of the first octave, px.
+        upright: describe patches as they lie in the image, not turned to their strongest gradients.
+        search_px: how far from where the gyro's rotation puts it a point is looked for.
+        blind_search_px: the same where there is no gyro.
+        memory_images: for how many images an absent point is remembered.
+        max_distance: of two descriptors of one point; they are unit vectors.
+        ratio: largest share of the second nearest descriptor's distance.
+        reject_outliers: by the epipolar geometry of two images.
+        outlier_px: distance from the epipolar line that contradicts it, in time and between the cameras.
+        normalise_exposure: bring every image to one mean and contrast.
+        border_px: no points nearer to the edge of the image.
+
+    Raises:
+        ConfigError: an option outside its range.
+    """
+
+    def __init__(
+        self,
+        *,
+        stereo: bool = False,
+        min_depth: float = 0.4,
+        max_points: int = 200,
+        min_distance_px: float = 14.0,
+        keypoints: int = 400,
+        spacing_px: int = 10,
+        contrast: float = 0.01,
+        edge: float = 10.0,
+        layers: int = 3,
+        sigma: float = 1.6,
+        upright: bool = True,
+        search_px: float = 15.0,
+        blind_search_px: float = 80.0,
+        memory_images: int = 5,
+        max_distance: float = 0.6,
+        ratio: float = 0.8,
+        reject_outliers: bool = True,
+        outlier_px: float = 2.0,
+        normalise_exposure: bool = True,
+        border_px: int = 16,
+    ) -> None:
+        check_positive(
+            "frontend",
+            min_depth=min_depth,
+            max_points=max_points,
+            min_distance_px=min_distance_px,
+            spacing_px=spacing_px,
+            contrast=contrast,
+            layers=layers,
+            sigma=sigma,
+            search_px=search_px,
+            blind_search_px=blind_search_px,
+            memory_images=memory_images,
+            outlier_px=outlier_px,
+            border_px=border_px,
+        )
+        _require("keypoints", keypoints, keypoints >= max_points, f"at least max_points={max_points}")
+        _require("edge", edge, edge > 1.0, "above 1")
+        _require("max_distance", max_distance, 0.0 < max_distance <= 2.0, "above 0 and at most 2")
+        _require("ratio", ratio, 0.0 < ratio <= 1.0, "above 0 and at most 1")
+        super().__init__(
+            name="sift",
+            extractor=SiftExtractor(
+                count=keypoints,
+                suppression_px=spacing_px,
+                spread=True,
+                contrast=contrast,
+                edge=edge,
+                layers=layers,
+                sigma=sigma,
+                upright=upright,
+            ),
+            options=KeeperOptions(
+                max_points=max_points,
+                min_distance_px=min_distance_px,
+                search_px=search_px,
+                blind_search_px=blind_search_px,
+                memory_images=memory_images,
+                max_distance=max_distance,
+                ratio=ratio,
+                reject_outliers=reject_outliers,
+                outlier_px=outlier_px,
+            ),
+            stereo=stereo,
+            min_depth=min_depth,
+            normalise=normalise_exposure,
+            border_px=border_px,
+        )
+
+
+def _require(option: str, value: object, good: bool, rule: str) -> None:
+    if not good:
+        raise ConfigError(f"frontend.{option} must be {rule}, got {value}")
