@@ -30,9 +30,12 @@ from vioframe.types import (
 )
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from torch import Tensor, nn
 
     from vioframe.learning.batch import WindowBatch
+    from vioframe.tracking import Tracker
 
 TRACKS, FLOW, EMBEDDING = "tracks", "flow", "embedding"
 """Fields of :class:`VisualFeatures`."""
@@ -202,26 +205,14 @@ class UsesGroundTruth(Protocol):
 
 
 @runtime_checkable
-class Trainable(Protocol):
-    """A component that *has* a net and can be trained; see ``vioframe/learning``.
-
-    In training the parts run on batches, in the order of the pipeline; what one returns is added, by name, to what
-    the later ones find ``upstream``. A part that answers with a motion of the camera returns it as
-    ``"T_prev_cur"``: (B, S - context_pairs + 1, 4, 4) in metres, for the last pairs of each window.
+class HasNet(Protocol):
+    """What has a net whose weights are kept in files; see ``vioframe/learning``.
 
     Attributes:
         net: all that is learned, the weights of a loss with several terms included, so that they are saved too.
-        context_pairs: how many pairs of images in a row one answer takes, 1 or more.
         architecture: plain values on which a file of weights must agree with this part, such as
             ``{"part": "tsvo", "backbone": "resnet50", "stack": 10}``. One that reads embeddings says of what length
             under ``embedding``.
-        needs_training: its answers mean nothing yet: it was given no weights, and does not work without any. An
-            experiment trains such a part first.
-
-    Two more it may have. ``learns_from``: ``"images"``, as all parts without it, or ``"answers"``: it is trained by
-    itself, after the others, on windows without images that bring what the parts before it answered; it finds their
-    ``"T_prev_cur"``, ``"covariance"`` (zero where none was stated) and ``"valid"`` upstream. ``training_pairs``: the
-    pairs of images that its windows should have where ``trainer.pairs`` does not say; else ``context_pairs``.
     """
 
     @property
@@ -230,12 +221,34 @@ class Trainable(Protocol):
         ...
 
     @property
-    def context_pairs(self) -> int:
+    def architecture(self) -> Mapping[str, str | int | float | bool]:
         """See the class."""
         ...
 
+
+@runtime_checkable
+class Trainable(HasNet, Protocol):
+    """A component that *has* a net and can be trained on windows of a recording; see ``vioframe/learning``.
+
+    In training the parts run on batches, in the order of the pipeline; what one returns is added, by name, to what
+    the later ones find ``upstream``. A part that answers with a motion of the camera returns it as
+    ``"T_prev_cur"``: (B, S - context_pairs + 1, 4, 4) in metres, for the last pairs of each window.
+
+    Attributes:
+        context_pairs: how many pairs of images in a row one answer takes, 1 or more.
+        needs_training: its answers mean nothing yet: it was given no weights, and does not work without any. An
+            experiment trains such a part first.
+
+    Three more it may have. ``learns_from``: ``"images"``, as all parts without it, or ``"answers"``: it is trained by
+    itself, after the others, on windows without images that bring what the parts before it answered; it finds their
+    ``"T_prev_cur"``, ``"covariance"`` (zero where none was stated) and ``"valid"`` upstream. ``training_pairs``: the
+    pairs of images that its windows should have where ``trainer.pairs`` does not say; else ``context_pairs``.
+    ``settling_pairs``: when all are trained it is trained further by itself, the others staying as they are, on windows
+    of so many pairs, as ``trainer.settling`` says.
+    """
+
     @property
-    def architecture(self) -> Mapping[str, str | int | float | bool]:
+    def context_pairs(self) -> int:
         """See the class."""
         ...
 
@@ -263,5 +276,29 @@ class Trainable(Protocol):
         Returns:
             scalars by name: ``"loss"`` is minimised, the others are only recorded. Empty for a part that is trained
             through the parts after it.
+        """
+        ...
+
+
+@runtime_checkable
+class TrainsItself(Protocol):
+    """A part with a training of its own, on something else than windows of a recording; ``task=train`` calls it."""
+
+    def train_itself(self, folder: "Path", tracker: "Tracker", *, shown: bool, resume: bool) -> "Mapping[str, Path]":
+        """Train, with the part's own options.
+
+        Args:
+            folder: of all that is written. While it trains, ``resume.ckpt`` there is what a training goes on from.
+            tracker: of the run, started.
+            shown: whether to show a progress bar.
+            resume: go on from ``resume.ckpt`` in the folder.
+
+        Returns:
+            files of weights by slot; empty where it ended, as its options said, before there were any.
+
+        Raises:
+            ConfigError: an option that cannot work.
+            DataError: files that cannot be used.
+            KeyboardInterrupt: the user stopped it.
         """
         ...

@@ -1,6 +1,7 @@
 """``task=train``: train the parts that have a net, together, and keep the weights that do best in validation.
 
-A fuser that learns from what a VO answers is trained by itself, and the VO has to know its answers by then.
+A fuser that learns from what a VO answers is trained by itself, and the VO has to know its answers by then. A part may
+bring a training of its own.
 """
 
 import logging
@@ -14,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from vioframe.build import build, build_pipeline
 from vioframe.errors import ConfigError, DataError
-from vioframe.interfaces import Trainable
+from vioframe.interfaces import Trainable, TrainsItself
 from vioframe.learning import require_torch
 from vioframe.tasks.answers import read_answered_splits
 from vioframe.tasks.decoding import read_splits
@@ -23,6 +24,9 @@ from vioframe.tasks.interruption import INTERRUPTED, terminate_like_interrupt
 from vioframe.tracking import NullTracker, Tracker
 
 log = logging.getLogger(__name__)
+
+RESUME_FILE = "resume.ckpt"
+"""What a training writes to be gone on with, in its folder."""
 
 
 def run(config: DictConfig) -> int:
@@ -33,6 +37,9 @@ def run(config: DictConfig) -> int:
     # With trainer.devices=2 lightning starts this command again for each further process; one speaks for all.
     follows = int(os.environ.get("LOCAL_RANK", "0")) > 0
     shown = bool(config.progress) and hydra_config.mode != RunMode.MULTIRUN and not follows
+    themselves = _train_themselves(config, choices)
+    if themselves:
+        return _run_own(themselves, config, choices, shown=shown)
     answers = _learns_from_answers(config, choices)
     options = trainer_options(config, choices, answers=answers)
     if options.resume is not None and not Path(options.resume).expanduser().is_file():
@@ -69,6 +76,66 @@ def run(config: DictConfig) -> int:
         for slot, path in trained.weights.items():
             log.info("weights of %s: %s (use them with %s.weights=...)", slot, path, slot)
     return 0
+
+
+def _train_themselves(config: DictConfig, choices: Mapping[str, str]) -> dict[str, TrainsItself]:
+    """The parts to train that have a training of their own, by slot.
+
+    Raises:
+        ConfigError: there are others beside them, which are trained otherwise.
+    """
+    parts = build_pipeline(config, choices).parts()
+    chosen = OmegaConf.select(config, "trainer.train")
+    wanted = {slot: part for slot, part in parts.items() if chosen is None or slot in chosen}
+    own = {slot: part for slot, part in wanted.items() if isinstance(part, TrainsItself)}
+    others = [slot for slot, part in wanted.items() if isinstance(part, Trainable) and slot not in own]
+    if own and others:
+        first, second = next(iter(own)), others[0]
+        raise ConfigError(
+            f"{first}={choices.get(first, '')} has a training of its own, {second}={choices.get(second, '')} has not: "
+            f"train one after the other, with trainer.train=[{first}] and trainer.train=[{second}]"
+        )
+    return own
+
+
+def _run_own(parts: Mapping[str, TrainsItself], config: DictConfig, choices: Mapping[str, str], *, shown: bool) -> int:
+    """Train parts by their own trainings, one after the other; the exit status."""
+    resume = OmegaConf.select(config, "trainer.resume")
+    output = Path(HydraConfig.get().runtime.output_dir)
+    folder = output if resume is None else Path(str(resume)).expanduser().parent
+    if resume is not None and not (folder / RESUME_FILE).is_file():
+        raise DataError(f"trainer.resume={resume}: there is no {RESUME_FILE} in {folder}")
+    tracker = build(config, "tracker", Tracker, choices.get("tracker", ""))
+    output.mkdir(parents=True, exist_ok=True)
+    (output / "config.yaml").write_text(OmegaConf.to_yaml(config, resolve=True), encoding="utf-8")
+    plain = OmegaConf.to_container(config, resolve=True)
+    parameters = {str(key): value for key, value in plain.items()} if isinstance(plain, dict) else {}
+    chosen = {slot: choices.get(slot, "none") for slot in parts}
+    weights: dict[str, Path] = {}
+    with terminate_like_interrupt(), tracker:
+        tracker.start(parameters, {"task": "train", **chosen}, name=f"train {' '.join(chosen.values())}")
+        try:
+            for slot, part in parts.items():
+                weights |= part.train_itself(
+                    folder if len(parts) == 1 else folder / slot, tracker, shown=shown, resume=resume is not None
+                )
+        except KeyboardInterrupt:
+            log.warning("interrupted; %s", _how_to_go_on(folder))
+            tracker.finish("killed", "interrupted by the user")
+            return INTERRUPTED
+        tracker.log_file(output / "config.yaml")
+        for slot, path in weights.items():
+            tracker.log_file(path, "weights")
+            tracker.log_file(path.with_suffix(".json"), "weights")
+            log.info("weights of %s: %s (use them with %s.weights=...)", slot, path, slot)
+        if len(weights) < len(parts):
+            log.warning("it ended before there were weights; %s", _how_to_go_on(folder))
+    return 0
+
+
+def _how_to_go_on(folder: Path) -> str:
+    resume = folder / RESUME_FILE
+    return f"go on with trainer.resume={resume}" if resume.exists() else "there is nothing to go on from yet"
 
 
 def _learns_from_answers(config: DictConfig, choices: Mapping[str, str]) -> bool:

@@ -1,0 +1,325 @@
+"""The whole training: MagicPoint on drawn shapes, labels by homographic adaptation, then both heads together.
+
+A folder of labels that is complete makes the first two stages needless; a resume file goes on within the stage that
+wrote it.
+"""
+
+import logging
+import os
+import platform
+import shutil
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import lightning
+import torch
+
+from vioframe import __version__
+from vioframe.errors import DataError
+from vioframe.learning.seeding import seed_everything
+from vioframe.learning.weights import load_weights, locate_weights, read_card, save_weights
+from vioframe.tracking import Tracker
+from vioframe_superpoint.net.superpoint import SuperPointNet, make_net
+from vioframe_superpoint.options import Encoder
+from vioframe_superpoint.training.data import MakeBatch, PairBatches, ShapeBatches
+from vioframe_superpoint.training.labelling import label_pictures
+from vioframe_superpoint.training.labels import LabelledPictures, LabelStore
+from vioframe_superpoint.training.loop import fit_stage, stage_of
+from vioframe_superpoint.training.module import JointLoss, RateOptions, StageModule, StepLoss, shapes_loss
+from vioframe_superpoint.training.options import TrainingOptions, plain_values
+from vioframe_superpoint.training.precision import resolve_precision
+from vioframe_superpoint.training.sources import picture_source
+from vioframe_superpoint.training.validation import PairValidation, ShapesValidation, validation_pairs
+from vioframe_superpoint.training.watching import RESUME_FILE, KeepBest, Progress, ResumePoint
+
+log = logging.getLogger(__name__)
+
+SHAPES, JOINT = "shapes", "joint"
+DETECTOR_FILE = "detector.safetensors"
+_LICENCE = "Apache-2.0; learned from generated pictures alone, unless pictures.folder says otherwise"
+
+
+@dataclass(slots=True, eq=False)
+class NamedNet:
+    """A net and what its weights must agree with.
+
+    Attributes:
+        net: SuperPoint's.
+        architecture: as of a part with a net.
+    """
+
+    net: SuperPointNet
+    architecture: Mapping[str, str | int | float | bool]
+
+
+class Training:
+    """A training of one net, in one folder.
+
+    Args:
+        encoder: of the net.
+        architecture: of the part whose weights come out.
+        options: of the training.
+        device: where.
+        folder: of weights, curves, pictures and resume file.
+        tracker: of the run.
+        shown: whether to show bars.
+        resume: go on from the resume file of the folder.
+
+    Raises:
+        DataError: the resume file is not whole, or was written with other options.
+    """
+
+    def __init__(
+        self,
+        encoder: Encoder,
+        architecture: Mapping[str, str | int | float | bool],
+        options: TrainingOptions,
+        *,
+        device: torch.device,
+        folder: Path,
+        tracker: Tracker,
+        shown: bool,
+        resume: bool,
+    ) -> None:
+        self._encoder = encoder
+        self._architecture = architecture
+        self._options = options
+        self._device = device
+        self._precision = resolve_precision(options.precision, device)
+        self._folder = folder
+        self._tracker = tracker
+        self._shown = shown
+        self._store = LabelStore(folder / "labels" if options.labels is None else Path(options.labels).expanduser())
+        self._resume: tuple[str, Path] | None = None
+        if resume:
+            stage, _, block = stage_of(folder / RESUME_FILE)
+            if block != options.save_every:
+                raise DataError(
+                    f"trainer.resume={folder / RESUME_FILE} was written with frontend.training.save_every={block}, not "
+                    f"{options.save_every}: a training that goes on keeps it"
+                )
+            self._resume = (stage, folder / RESUME_FILE)
+        self._until = None if options.max_minutes is None else time.monotonic() + 60.0 * options.max_minutes
+
+    def run(self) -> Path | None:
+        """Train, as far as the time allows.
+
+        Returns:
+            The best weights so far, or None.
+
+        Raises:
+            ConfigError: an option that cannot work, or a learning rate that diverges.
+            DataError: files that do not fit.
+            KeyboardInterrupt: the user stopped it.
+        """
+        self._folder.mkdir(parents=True, exist_ok=True)
+        if not self._store.is_complete and not self._make_labels():
+            return None
+        return self._train_jointly()
+
+    def _make_labels(self) -> bool:
+        """The first two stages; whether they are done."""
+        detector = self._store.folder / DETECTOR_FILE
+        net = self._new_net()
+        if self._options.detector is not None:
+            key = "frontend.training.detector"
+            given = locate_weights(self._options.detector, key)
+            load_weights(given, net, key)
+            about = {"file": given.name, **_excerpt(read_card(given))}
+        else:
+            if not detector.exists() and not self._train_on_shapes(net):
+                return False
+            load_weights(detector, net, "frontend.training.labels")
+            about = _excerpt(read_card(detector))
+        pictures = self._options.pictures
+        source = picture_source(pictures, self._options.seed)
+        return label_pictures(
+            self._store,
+            source,
+            net.net.to(self._device),
+            self._options.adaptation,
+            seed=self._options.seed,
+            precision=self._precision,
+            about={
+                "detector": {"architecture": dict(self._architecture), **about},
+                "pictures": plain_values(pictures),
+                "adaptation": plain_values(self._options.adaptation),
+                "seed": self._options.seed,
+            },
+            until=self._until,
+            shown=self._shown,
+        )
+
+    def _train_on_shapes(self, net: NamedNet) -> bool:
+        """The first stage; whether it is done."""
+        options = self._options.shapes
+        validation = ShapesValidation(net.net, options)
+        best = self._folder / "weights" / DETECTOR_FILE
+        done = self._fit(
+            SHAPES,
+            net,
+            shapes_loss,
+            ShapeBatches(options, self._options.seed),
+            RateOptions(
+                iterations=options.iterations,
+                learning_rate=options.learning_rate,
+                schedule="cosine",
+                warmup=self._options.warmup,
+                weight_decay=0.0,
+            ),
+            validation=validation,
+            best=best,
+            about={"training": plain_values(options), "seed": self._options.seed},
+            rate_key="frontend.training.shapes.learning_rate",
+        )
+        if done:
+            self._store.folder.mkdir(parents=True, exist_ok=True)
+            for path in (best.with_suffix(".json"), best):
+                shutil.copyfile(path, self._store.folder / f"{path.name}.partial")
+                os.replace(self._store.folder / f"{path.name}.partial", self._store.folder / path.name)
+        return done
+
+    def _train_jointly(self) -> Path | None:
+        """The third stage; the best weights so far."""
+        labelled = self._store.read()
+        held_out = int(labelled.about["pictures"]["held_out"])
+        learned = LabelledPictures(
+            pictures=labelled.pictures[:-held_out], points=labelled.points[:-held_out], about=labelled.about
+        )
+        net = self._new_net()
+        start = self._start(net)
+        options = self._options
+        pairs = validation_pairs(labelled.pictures[-held_out:], options.pairs.lighting, options.seed)
+        path = self._folder / "weights" / f"superpoint-{self._encoder.name}.safetensors"
+        done = self._fit(
+            JOINT,
+            net,
+            JointLoss(options.descriptor_loss),
+            PairBatches(learned, options.pairs, options.batch_size, options.seed),
+            RateOptions(
+                iterations=options.iterations,
+                learning_rate=options.learning_rate,
+                schedule=options.schedule,
+                warmup=options.warmup,
+                weight_decay=options.weight_decay,
+            ),
+            validation=PairValidation(net.net, pairs),
+            best=path,
+            about={"training": options.settings(), "labels": dict(labelled.about), "start": start},
+            rate_key="frontend.training.learning_rate",
+        )
+        if not done:
+            log.info("the time of this session is over before the training is")
+        return path if path.exists() else None
+
+    def _start(self, net: NamedNet) -> str:
+        """First weights: those of the detector that made the labels, where it is of the same architecture."""
+        detector = self._store.folder / DETECTOR_FILE
+        if detector.exists() and read_card(detector).get("architecture") == dict(self._architecture):
+            load_weights(detector, net, "frontend.training.labels")
+            return f"{DETECTOR_FILE} of the labels"
+        return "random"
+
+    def _new_net(self) -> NamedNet:
+        seed_everything(self._options.seed)
+        return NamedNet(make_net(self._encoder), self._architecture)
+
+    def _fit(
+        self,
+        stage: str,
+        net: NamedNet,
+        loss: StepLoss,
+        make: MakeBatch,
+        rate: RateOptions,
+        *,
+        validation: ShapesValidation | PairValidation,
+        best: Path,
+        about: Mapping[str, object],
+        rate_key: str,
+    ) -> bool:
+        """Train through a stage, or go on with it; whether it is done."""
+        resume = self._resume[1] if self._resume is not None and self._resume[0] == stage else None
+        options = self._options
+        module = StageModule(net.net, loss, rate)
+        figures: dict[str, float] = {}
+
+        def validate(iteration: int) -> Mapping[str, float]:
+            net.net.eval()
+            try:
+                figures.clear()
+                figures.update(validation.figures())
+                picture = self._folder / "pictures" / f"{stage}-{iteration:06d}.png"
+                validation.draw(picture)
+                self._tracker.log_file(picture, "pictures")
+            finally:
+                net.net.train()
+            return figures
+
+        progress = Progress(
+            stage,
+            rate.iterations,
+            options.save_every,
+            validate=validate,
+            every=options.validate_every,
+            folder=self._folder,
+            tracker=self._tracker,
+            shown=self._shown,
+            rate_key=rate_key,
+        )
+
+        def save(iteration: int) -> None:
+            card = {
+                "stage": stage,
+                "iteration": iteration,
+                "iterations": rate.iterations,
+                "hours": progress.seconds / 3600.0,
+                "validation": dict(figures),
+                **about,
+                "precision": self._precision,
+                "machine": _machine(self._device),
+                "code": {"vioframe": __version__, "torch": torch.__version__, "lightning": lightning.__version__},
+                "licence": _LICENCE,
+                "made": datetime.now(UTC).isoformat(timespec="seconds"),
+            }
+            save_weights(best, net, card)
+
+        keep = KeepBest(progress, save)
+        point = ResumePoint(self._folder, self._until)
+        log.info(
+            "%s: %d iterations%s, %s on %s",
+            stage,
+            rate.iterations,
+            "" if resume is None else f", going on after {stage_of(resume)[1]}",
+            self._precision,
+            self._device,
+        )
+        net.net.to(self._device)
+        fit_stage(
+            module,
+            make,
+            iterations=rate.iterations,
+            block=options.save_every,
+            workers=options.workers,
+            device=self._device,
+            precision=self._precision,
+            gradient_clip=options.gradient_clip,
+            folder=self._folder,
+            resume=resume,
+            watchers=(progress, keep, point),
+        )
+        if (self._folder / f"{stage}.csv").exists():
+            self._tracker.log_file(self._folder / f"{stage}.csv")
+        return not point.stopped
+
+
+def _machine(device: torch.device) -> dict[str, object]:
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or platform.machine()
+    return {"device": device.type, "name": name, "threads": torch.get_num_threads()}
+
+
+def _excerpt(card: Mapping[str, object]) -> dict[str, object]:
+    """What labels should tell of the detector that made them."""
+    return {name: card[name] for name in ("iteration", "hours", "validation", "training", "seed") if name in card}
