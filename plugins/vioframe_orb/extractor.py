@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from vioframe.types import Image
-from vioframe.vision.corners import CornerDetector
+from vioframe.vision.corners import CornerDetector, place_corners
 from vioframe.vision.keypoints import Keypoints
 
 _BYTES = 32
@@ -56,7 +56,7 @@ class OrbExtractor:
             allowed=allowed,
         )
         pixels, scores = detector.detect(gray, np.zeros((0, 2)), self._count)
-        pixels = self._place(gray, pixels)
+        pixels = place_corners(gray, pixels, self._subpixel)
         if len(pixels) == 0:
             return Keypoints(pixels=pixels, scores=scores, descriptors=np.zeros((0, _BYTES), np.uint8))
         angles = np.zeros(len(pixels)) if self._upright else orientations(gray, pixels)
@@ -68,18 +68,6 @@ class OrbExtractor:
         # Points whose patch would leave the image are left out.
         rows = np.array([point.class_id for point in kept], dtype=int)
         return Keypoints(pixels=pixels[rows], scores=scores[rows], descriptors=descriptors)
-
-    def _place(self, gray: Image, pixels: np.ndarray) -> np.ndarray:
-        """Sub-pixel corners (M, 2); those that would leave their window stay where they were."""
-        if self._subpixel == 0 or len(pixels) == 0:
-            return pixels
-        side = (self._subpixel, self._subpixel)
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.01)
-        placed = cv2.cornerSubPix(gray, np.ascontiguousarray(pixels, np.float32), side, (-1, -1), criteria)
-        placed = placed.reshape(-1, 2)
-        near = np.linalg.norm(placed - pixels, axis=-1) < self._subpixel
-        refined: np.ndarray = np.where(near[:, None], placed, pixels).astype(float)
-        return refined
 
 
 def orientations(gray: Image, pixels: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from vioframe.errors import ConfigError
-from vioframe.interfaces import Trainable
+from vioframe.interfaces import HasNet
 from vioframe.learning import require_torch
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class NetHolder:
 
     def __init__(
         self,
-        part: Trainable,
+        part: HasNet,
         slot: str,
         name: str,
         make: "Callable[[], nn.Module]",

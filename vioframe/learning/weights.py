@@ -15,14 +15,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from vioframe.errors import ConfigError, DataError
-from vioframe.interfaces import Trainable
+from vioframe.interfaces import HasNet
 
 FORMAT = "vioframe-weights-1"
 
 _SCHEMES = ("models:/", "runs:/")
 
 
-def save_weights(path: Path, part: Trainable, card: Mapping[str, object]) -> None:
+def save_weights(path: Path, part: HasNet, card: Mapping[str, object]) -> None:
     """Write ``path`` (.safetensors) and its card (.json beside it); each appears whole or not at all."""
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in part.net.state_dict().items()}
     header = {"format": FORMAT, "architecture": json.dumps(dict(part.architecture), sort_keys=True)}
@@ -92,7 +92,7 @@ def locate_weights(source: str, key: str) -> Path:
     return found[0]
 
 
-def load_weights(path: Path, part: Trainable, key: str) -> None:
+def load_weights(path: Path, part: HasNet, key: str) -> None:
     """Load a file of weights into the net of ``part``, all of it or nothing.
 
     Args:
@@ -119,7 +119,7 @@ def load_weights(path: Path, part: Trainable, key: str) -> None:
     part.net.load_state_dict(state)
 
 
-def _check_header(header: Mapping[str, str], part: Trainable, path: Path, key: str) -> None:
+def _check_header(header: Mapping[str, str], part: HasNet, path: Path, key: str) -> None:
     if header.get("format") != FORMAT:
         raise DataError(
             f"{key}={path} was not written by vioframe: its header says format={header.get('format')!r}, not {FORMAT!r}"
@@ -147,7 +147,7 @@ def _check_header(header: Mapping[str, str], part: Trainable, path: Path, key: s
         )
 
 
-def _check_state(state: Mapping[str, torch.Tensor], part: Trainable, path: Path, key: str) -> None:
+def _check_state(state: Mapping[str, torch.Tensor], part: HasNet, path: Path, key: str) -> None:
     own = part.net.state_dict()
     if set(state) != set(own):
         odd = sorted(set(state) ^ set(own))

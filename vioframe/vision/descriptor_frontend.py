@@ -1,6 +1,6 @@
 """A front end of any keypoints with descriptors: extract, match, keep."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ from vioframe.checks import Array
 from vioframe.errors import DataError, StateError
 from vioframe.geometry import camera as projection
 from vioframe.interfaces import IMAGES, STEREO, STEREO_TRACKS, TRACKS, Frontend
-from vioframe.types import Camera, Frame, SensorRig, Tracks, VisualFeatures
+from vioframe.types import Camera, Frame, Image, SensorRig, Tracks, VisualFeatures
 from vioframe.vision.gray import gray_image, normalise_exposure
 from vioframe.vision.keeper import KeeperOptions, TrackKeeper
 from vioframe.vision.keypoints import Extractor, Keypoints
@@ -93,36 +93,57 @@ class DescriptorFrontend(Frontend):
             StateError: called before ``setup``.
             DataError: the frame lacks an image, or has one that does not fit the calibration.
         """
-        if self._camera is None:
-            raise StateError(f"{type(self).__name__}.process was called before setup(rig): set it up first")
-        keypoints, bearings = self._see(frame, 0)
+        keypoints = [
+            self._extractor.extract(gray, mask) for gray, mask in zip(self.gray_images(frame), self.masks, strict=True)
+        ]
+        return self.follow(frame, keypoints, R_prev_cur)
+
+    @property
+    def masks(self) -> list[np.ndarray]:
+        """(H, W) uint8 for each camera that is looked at, not 0 where a point may lie.
+
+        Raises:
+            StateError: called before ``setup``.
+        """
+        self._calibrated()
+        return self._masks
+
+    def gray_images(self, frame: Frame) -> list[Image]:
+        """The image (H, W) uint8 of each camera that is looked at, as the extractor is given it; errors as above."""
+        self._calibrated()
+        grays = [gray_image(frame, index, camera, self._name) for index, camera in enumerate(self._cameras)]
+        return [normalise_exposure(gray) for gray in grays] if self._normalise else grays
+
+    def follow(self, frame: Frame, keypoints: Sequence[Keypoints], R_prev_cur: Array | None) -> VisualFeatures:
+        """What :meth:`process` returns, of keypoints that were found in the image of each camera."""
+        camera = self._calibrated()
+        bearings = projection.bearings(camera, keypoints[0].pixels)
         R_cam = None
         if R_prev_cur is not None:
-            R_body_cam = self._camera.T_body_cam[:3, :3]
+            R_body_cam = camera.T_body_cam[:3, :3]
             R_cam = R_body_cam.T @ R_prev_cur @ R_body_cam
-        ids, index, ages = self._keeper.keep(keypoints, bearings, R_cam)
+        ids, index, ages = self._keeper.keep(keypoints[0], bearings, R_cam)
         self._lost_all += self._points > 0 and not (ages > 1).any()
         self._points = len(ids)
-        points, bearings = keypoints.select(index), bearings[index]
+        points = keypoints[0].select(index)
         tracks = Tracks(
             ids=ids,
             pixels=points.pixels,
-            bearings=bearings,
+            bearings=bearings[index],
             scores=ages.astype(float),
             descriptors=points.descriptors,
         )
-        stereo = self._match_stereo(frame, tracks, self._pair, points) if self._pair is not None else None
+        stereo = self._match_stereo(tracks, self._pair, points, keypoints[1]) if self._pair is not None else None
         return VisualFeatures(frame=frame, tracks=tracks, stereo=stereo)
 
-    def _see(self, frame: Frame, index: int) -> tuple[Keypoints, Array]:
-        camera = self._cameras[index]
-        gray = gray_image(frame, index, camera, self._name)
-        keypoints = self._extractor.extract(normalise_exposure(gray) if self._normalise else gray, self._masks[index])
-        return keypoints, projection.bearings(camera, keypoints.pixels)
+    def _calibrated(self) -> Camera:
+        if self._camera is None:
+            raise StateError(f"{type(self).__name__}.process was called before setup(rig): set it up first")
+        return self._camera
 
-    def _match_stereo(self, frame: Frame, tracks: Tracks, pair: TwoCameras, points: Keypoints) -> Tracks:
+    def _match_stereo(self, tracks: Tracks, pair: TwoCameras, points: Keypoints, keypoints: Keypoints) -> Tracks:
         """The points that camera 1 sees too."""
-        keypoints, bearings = self._see(frame, 1)
+        bearings = projection.bearings(self._cameras[1], keypoints.pixels)
         rows, columns = pair.possible_pairs(tracks.bearings, bearings)
         rows, columns = match(
             points.descriptors,

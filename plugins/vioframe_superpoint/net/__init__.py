@@ -5,6 +5,6 @@
 ``superpoint``     an encoder and the heads of detector and descriptors
 ``keypoints``      from what the heads say to points: heat, suppression, sampled descriptors
 ``layers``         what the others are built of
-``fusing``         the same net with batch normalisation folded into its convolutions, for use
+``inference``      the same net for use: folded normalisation, descriptors where points are and nowhere else
 =================  ====================================================================
 """

@@ -49,21 +49,35 @@ def sample_descriptors(descriptors: Tensor, pixels: Tensor) -> Tensor:
         pixels: (B, N, 2) px, x right and y down; the centre of the top-left pixel is (0, 0).
     """
     batch, channels, height, width = descriptors.shape
+    # Where channels lie together in memory this copies nothing, and each corner is one read of a row.
+    rows = descriptors.permute(0, 2, 3, 1).reshape(batch * height * width, channels)
+    cells, shares = surrounding_cells(pixels, height, width)
+    cells = cells + torch.arange(batch, device=rows.device)[:, None, None] * (height * width)
+    mixed = (functional.embedding(cells, rows) * shares.to(rows.dtype)[..., None]).sum(dim=-2)
+    return functional.normalize(mixed, dim=-1)
+
+
+def surrounding_cells(pixels: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Numbers (..., 4), row by row, of the cells around pixels (..., 2) px, and each one's bilinear share (..., 4).
+
+    Args:
+        pixels: as of :func:`sample_descriptors`.
+        height: of the map, in cells.
+        width: likewise.
+    """
     places = (pixels.to(torch.float32) - _CENTRE) / CELL_PX
     x = places[..., 0].clamp(0.0, width - 1.0)
     y = places[..., 1].clamp(0.0, height - 1.0)
     left = x.detach().floor().clamp(max=max(width - 2, 0))
     top = y.detach().floor().clamp(max=max(height - 2, 0))
-    # Where channels lie together in memory this copies nothing, and each corner is one read of a row.
-    rows = descriptors.permute(0, 2, 3, 1).reshape(batch * height * width, channels)
-    images = torch.arange(batch, device=rows.device)[:, None] * (height * width)
-    first = images + top.long() * width + left.long()
+    first = top.long() * width + left.long()
     right, down = min(1, width - 1), width * min(1, height - 1)
-    along, across = (x - left)[..., None], (y - top)[..., None]
-    corners = [functional.embedding(first + step, rows).float() for step in (0, right, down, down + right)]
-    upper = corners[0] + along * (corners[1] - corners[0])
-    lower = corners[2] + along * (corners[3] - corners[2])
-    return functional.normalize(upper + across * (lower - upper), dim=-1)
+    along, across = x - left, y - top
+    numbers = torch.stack([first, first + right, first + down, first + down + right], dim=-1)
+    shares = torch.stack(
+        [(1 - across) * (1 - along), (1 - across) * along, across * (1 - along), across * along], dim=-1
+    )
+    return numbers, shares
 
 
 def _square_maximum(values: Tensor, radius: int) -> Tensor:

@@ -26,6 +26,25 @@ ENCODERS: Mapping[str, type[Vgg] | type[MobileNetV2] | type[GhostNet]] = {
 """By the name that ``encoder=`` has."""
 
 
+class Head(nn.Module):
+    """A 3×3 convolution to 256 channels, and a linear layer of what it finds in each cell.
+
+    Args:
+        inputs: channels.
+        outputs: channels.
+    """
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.wide = convolution(inputs, HEAD_CHANNELS, active=nn.ReLU(inplace=True))
+        self.last = nn.Conv2d(HEAD_CHANNELS, outputs, 1)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(B, inputs, h, w) to (B, outputs, h, w)."""
+        answer: Tensor = self.last(self.wide(features))
+        return answer
+
+
 class SuperPointNet(nn.Module):
     """Where points are and how they look, for each cell of 8×8 pixels.
 
@@ -36,8 +55,8 @@ class SuperPointNet(nn.Module):
     def __init__(self, encoder: EncoderNet) -> None:
         super().__init__()
         self.encoder = encoder
-        self.detector = _head(encoder.channels, DETECTOR_CHANNELS)
-        self.descriptor = _head(encoder.channels, DESCRIPTOR_CHANNELS)
+        self.detector = Head(encoder.channels, DETECTOR_CHANNELS)
+        self.descriptor = Head(encoder.channels, DESCRIPTOR_CHANNELS)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Run the net.
@@ -64,9 +83,3 @@ def make_net(encoder: Encoder | str) -> SuperPointNet:
     """
     options = encoder_named(encoder) if isinstance(encoder, str) else encoder
     return SuperPointNet(ENCODERS[options.name](options.width))
-
-
-def _head(inputs: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(
-        convolution(inputs, HEAD_CHANNELS, active=nn.ReLU(inplace=True)), nn.Conv2d(HEAD_CHANNELS, outputs, 1)
-    )
