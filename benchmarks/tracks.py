@@ -23,10 +23,11 @@ from vioframe.geometry.interpolation import interpolate_poses
 from vioframe.interfaces import Frontend
 from vioframe.types import Frame
 from vioframe_klt import KltFrontend
+from vioframe_opencv import SiftFrontend
 from vioframe_orb import OrbFrontend
 from vioframe_recordings import EurocDataset
 
-FRONTENDS = {"klt": KltFrontend, "orb": OrbFrontend}
+FRONTENDS = {"klt": KltFrontend, "orb": OrbFrontend, "sift": SiftFrontend}
 AGES = ((2, 6), (6, 16), (16, 41), (41, 10**6))
 EDGE_RATIO = 1.03
 GROSS_PX = 3.0
