@@ -229,7 +229,17 @@ class Smoother:
 
     def _open(self, state: NavState, covariance: Array) -> None:
         """A fresh solver with the oldest keyframe alone, and its priors."""
+        try:
+            self._open_with(state, covariance, "CHOLESKY")
+        except RuntimeError as error:
+            # Beside the tie of the camera, a place that is only known to half a metre, as after long dead reckoning,
+            # is free in the eyes of gtsam's Cholesky. QR takes it, and a little longer.
+            log.debug("the window is solved by QR: %s", error)
+            self._open_with(state, covariance, "QR")
+
+    def _open_with(self, state: NavState, covariance: Array, factorisation: str) -> None:
         parameters = gtsam.ISAM2Params()
+        parameters.setFactorization(factorisation)
         parameters.setRelinearizeThreshold(self._window.relinearise_above)
         parameters.relinearizeSkip = 1
         parameters.findUnusedFactorSlots = True
