@@ -58,6 +58,7 @@ def options(folder, **changes) -> TrainerOptions:
         "workers": 0,
         "resume": None,
         "fusion": {},
+        "settling": {},
     }
     return TrainerOptions(**{**plain, **changes}, augmentation=augmentation)
 

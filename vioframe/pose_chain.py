@@ -4,6 +4,8 @@ What odometry without a filter shares: where it begins, how it goes on where no 
 gives.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from vioframe.checks import Array
@@ -15,6 +17,21 @@ from vioframe.types import ImuBlock, NavState, Status
 
 # What NavState.covariance says of biases that nobody estimated: as good as unknown.
 _UNKNOWN_GYRO_BIAS, _UNKNOWN_ACCEL_BIAS = 0.1, 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LastingErrors:
+    """K errors that a motion shares with those before and after it, such as what is left of a gyro's bias.
+
+    Attributes:
+        jacobian: (6, K), what one unit of each does to the motion, right perturbation.
+        variances: (K,), in squared units; they are independent of each other.
+        kept: (K,), 0 to 1, share of each as it was over the motion before that is in it still.
+    """
+
+    jacobian: Array
+    variances: Array
+    kept: Array
 
 
 class PoseChain:
@@ -52,6 +69,8 @@ class PoseChain:
         self._age_s = 0.0
         # (6, 6) of (rotation, translation), right perturbation of T_world_body; None once a motion states none.
         self._covariance: Array | None = None
+        # (6, K), of that error with those that last; None while there are none.
+        self._shared: Array | None = None
         self._velocity_covariance: Array = np.zeros((3, 3))
 
     @property
@@ -90,7 +109,15 @@ class PoseChain:
         self._covariance = into_local @ covariance[:6, :6] @ into_local.T
         self._velocity_covariance = covariance[6:9, 6:9]
 
-    def follow(self, motion: Array, covariance: Array | None, stamp_ns: int, *, known: bool = True) -> None:
+    def follow(
+        self,
+        motion: Array,
+        covariance: Array | None,
+        stamp_ns: int,
+        *,
+        known: bool = True,
+        lasting: LastingErrors | None = None,
+    ) -> None:
         """Append a motion.
 
         Args:
@@ -98,6 +125,7 @@ class PoseChain:
             covariance: (6, 6) of it, right perturbation, or None where its error is not known.
             stamp_ns: when it ends.
             known: False for a mere guess: it leaves the last known motion to grow older, and is trusted less for that.
+            lasting: errors beyond ``covariance`` that it shares with other motions, the same ones each time.
         """
         duration = seconds(stamp_ns - self._stamp_ns)
         if known:
@@ -105,7 +133,7 @@ class PoseChain:
             self._age_s = 0.5 * duration
         elif covariance is not None:
             covariance = covariance + self._drift(duration)
-        self._append(motion, covariance, stamp_ns)
+        self._append(motion, covariance, stamp_ns, lasting)
 
     def coast(self, stamp_ns: int) -> None:
         """Go on to this time without a known motion."""
@@ -145,7 +173,9 @@ class PoseChain:
         sigmas = np.repeat([rate * np.sqrt(end**2 - start**2), 0.5 * accel * np.sqrt(end**4 - start**4)], 3)
         return np.diag(sigmas**2)
 
-    def _append(self, motion: Array, covariance: Array | None, stamp_ns: int) -> None:
+    def _append(
+        self, motion: Array, covariance: Array | None, stamp_ns: int, lasting: LastingErrors | None = None
+    ) -> None:
         duration = seconds(stamp_ns - self._stamp_ns)
         before = self._T_world_body
         after = before @ motion
@@ -154,12 +184,29 @@ class PoseChain:
             self._covariance = None
         else:
             back = se3.adjoint(se3.inverse(motion))
+            if self._shared is not None:
+                self._shared = back @ self._shared
             self._covariance = back @ self._covariance @ back.T + covariance
+            if lasting is not None:
+                covariance = covariance + self._share(lasting)
             R = after[:3, :3]
             self._velocity_covariance = R @ covariance[3:, 3:] @ R.T / duration**2
         self._velocity = (after[:3, 3] - before[:3, 3]) / duration
         self._T_world_body = after
         self._stamp_ns = stamp_ns
+
+    def _share(self, lasting: LastingErrors) -> Array:
+        """Add what errors that last do to the pose; return the covariance (6, 6) of what they do to the motion."""
+        J = lasting.jacobian
+        before = np.zeros_like(J) if self._shared is None else self._shared * lasting.kept
+        own = J * lasting.variances
+        # ξ ← ξ + J e: the pose's error so far shares with e what is left of it since the motion before.
+        cross = before @ J.T
+        alone: Array = own @ J.T
+        if self._covariance is not None:
+            self._covariance = self._covariance + cross + cross.T + alone
+        self._shared = before + own
+        return alone
 
 
 def _local_from_state(T_world_body: Array) -> Array:

@@ -17,7 +17,11 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from vioframe.learning.batch import WindowBatch
+    from vioframe_vinet.net.memo import Memo
     from vioframe_vinet.net.pair_flow import PairFlow
+
+# Pairs that a frozen encoder is given at once.
+_AT_ONCE = 64
 
 Flow = Literal["dis", "none"]
 
@@ -72,6 +76,7 @@ class PairEncoder(Frontend):
         self._holder = NetHolder(self, "frontend", "pair_encoder", self._make_net, weights, device)
         self._before: Tensor | None = None
         self._flow: PairFlow | None = None
+        self._memo: Memo | None = None
         self._ready = False
 
     @property
@@ -149,6 +154,9 @@ class PairEncoder(Frontend):
             ConfigError: images of another size than the net's.
         """
         self._holder.taught()
+        frozen = not self.net.training and not any(each.requires_grad for each in self.net.parameters())
+        if frozen and batch.images.device.type == "cpu":
+            return {EMBEDDING: self._remembered(batch.images)}
         pairs = self._images.pairs_of_batch(batch.images)
         embedding = self._embeddings(pairs.flatten(0, 1))
         return {EMBEDDING: embedding.reshape(*pairs.shape[:2], self._features)}
@@ -178,6 +186,25 @@ class PairEncoder(Frontend):
             VisualFeatures(frame=frame, embedding=embedding if frame.images else None)
             for frame, embedding in zip(frames, found, strict=True)
         ]
+
+    def _remembered(self, images: "Tensor") -> "Tensor":
+        """(B, S, D) of windows, each pair encoded when it is first seen."""
+        import torch
+
+        from vioframe_vinet.net.memo import Memo
+
+        self._memo = self._memo or Memo()
+
+        def encode(places: "Tensor") -> "Tensor":
+            made = []
+            for first in range(0, len(places), _AT_ONCE):
+                window, pair = places[first : first + _AT_ONCE].unbind(1)
+                two = torch.stack([images[window, pair], images[window, pair + 1]], dim=1)
+                made.append(self._embeddings(self._images.pairs_of_batch(two).flatten(0, 1)))
+            return torch.cat(made)
+
+        with torch.no_grad():
+            return self._memo.embeddings(self.net, images, encode)
 
     def _embeddings(self, pairs: "Tensor") -> "Tensor":
         """(N, D) of pairs (N, 6, H, W) in [0, 1]."""

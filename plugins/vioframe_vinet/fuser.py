@@ -2,15 +2,12 @@
 
 import logging
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
-
-import numpy as np
 
 from vioframe.checks import Array, check_not_negative, check_positive
 from vioframe.conventions import seconds
-from vioframe.errors import ConfigError, DataError, StateError
-from vioframe.geometry import se3, so3
+from vioframe.errors import ConfigError, StateError
 from vioframe.interfaces import EMBEDDING, Fuser
 from vioframe.learning.holder import NetHolder
 from vioframe.pose_chain import PoseChain
@@ -21,7 +18,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from vioframe.learning.batch import WindowBatch
-    from vioframe_vinet.net.core import CoreAnswer, CoreState
+    from vioframe_vinet.net.stream import Stream
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +31,8 @@ class VinetFuser(Fuser):
 
     Args:
         embedding: numbers that the front end gives for a pair of images.
-        window: pairs of a training window; in use it remembers without end.
+        window: pairs of a training window, and those over which poses are composed; in use it remembers without end.
+        settling: pairs of the windows from which it learns by itself, when it and the front end are trained.
         imu_intervals: to which the inertial samples between two images are brought, whatever their rate.
         imu_hidden: neurons of each layer of the LSTM over them.
         imu_layers: its layers.
@@ -47,10 +45,12 @@ class VinetFuser(Fuser):
         rotation: the ``gyro``'s, corrected by what images say of its bias, or ``learned`` whole.
         gyro_bias_sigma: rad/s an axis, of that bias at first.
         gyro_memory: pairs after which what images said of it counts 1/e.
+        scale_memory: pairs after which 1/e is left of an error of lengths.
         feedback: the core sees its own ``pose`` since it began to remember, or ``none``.
         rotation_unit_rad: what an output of 1 means.
         translation_unit_m: likewise.
-        loss: ``learned`` weights, or the ``likelihood`` of a Gaussian, with which it states a covariance.
+        loss: ``learned`` weights, or those and the ``likelihood`` of a Gaussian, with which it states a covariance.
+        horizons: pairs over which errors are summed up for that likelihood.
         pose_weight: of the composed poses beside the motions, in training.
         log_variance_rotation: from which ``learned`` starts, ln rad².
         log_variance_translation: likewise, ln m².
@@ -74,7 +74,8 @@ class VinetFuser(Fuser):
         self,
         *,
         embedding: int = 256,
-        window: int = 8,
+        window: int = 16,
+        settling: int = 200,
         imu_intervals: int = 10,
         imu_hidden: int = 64,
         imu_layers: int = 2,
@@ -86,13 +87,15 @@ class VinetFuser(Fuser):
         rotation: Rotation = "gyro",
         gyro_bias_sigma: float = 0.01,
         gyro_memory: int = 300,
+        scale_memory: int = 300,
         feedback: Feedback = "none",
         rotation_unit_rad: float = 0.005,
         translation_unit_m: float = 1.0,
         loss: Loss = "likelihood",
+        horizons: Sequence[int] = (50, 100, 200),
         pose_weight: float = 1.0,
         log_variance_rotation: float = -12.0,
-        log_variance_translation: float = 0.0,
+        log_variance_translation: float = -3.0,
         lost_images: float = 0.1,
         lost_imu: float = 0.1,
         level: bool = True,
@@ -106,6 +109,7 @@ class VinetFuser(Fuser):
         self._options = NetOptions(
             embedding=embedding,
             window=window,
+            settling=settling,
             imu_intervals=imu_intervals,
             imu_hidden=imu_hidden,
             imu_layers=imu_layers,
@@ -117,10 +121,12 @@ class VinetFuser(Fuser):
             rotation=rotation,
             gyro_bias_sigma=gyro_bias_sigma,
             gyro_memory=gyro_memory,
+            scale_memory=scale_memory,
             feedback=feedback,
             rotation_unit_rad=rotation_unit_rad,
             translation_unit_m=translation_unit_m,
             loss=loss,
+            horizons=tuple(horizons),
             pose_weight=pose_weight,
             log_variance_rotation=log_variance_rotation,
             log_variance_translation=log_variance_translation,
@@ -136,7 +142,8 @@ class VinetFuser(Fuser):
             levelled=level, tilt_sigma=tilt_sigma, rate_sigma=blind_rate_sigma, accel_sigma=blind_accel_sigma
         )
         self._holder = NetHolder(self, "fuser", "vinet", self._make_net, weights, device)
-        self._ready = False
+        self._stream: Stream | None = None
+        self._given: NavState | None = None
 
     @property
     def net(self) -> "nn.Module":
@@ -150,8 +157,18 @@ class VinetFuser(Fuser):
 
     @property
     def context_pairs(self) -> int:
-        """So many that in validation each answer remembers a window, as in training."""
+        """From one pair on it answers."""
+        return 1
+
+    @property
+    def training_pairs(self) -> int:
+        """Pairs of the windows that it learns from together with the front end."""
         return self._options.window
+
+    @property
+    def settling_pairs(self) -> int:
+        """Pairs of the windows that it learns from by itself."""
+        return self._options.settling
 
     @property
     def needs_training(self) -> bool:
@@ -175,15 +192,15 @@ class VinetFuser(Fuser):
                 "fuser=vinet needs the place of the camera on the body (rig.cameras[0].T_body_cam), but the recording "
                 "has no camera: choose fuser=imu_only, or a recording with a camera"
             )
-        self._holder.prepare()
-        self._T_body_cam: Array = rig.cameras[0].T_body_cam
+        from vioframe_vinet.net.stream import Stream
+
+        net = self._holder.prepare()
+        self._stream = Stream(net, self._options, rig.cameras[0].T_body_cam, self._holder.device())
         self._chain.forget()
-        self._given: NavState | None = None
-        self._state: CoreState | None = None
+        self._given = None
         self._unseen_s = 0.0
         self._counts: Counter[str] = Counter()
         self._told_of_rate = False
-        self._ready = True
 
     def start_from(self, state: NavState) -> None:
         """Start from the pose of a given state."""
@@ -191,16 +208,16 @@ class VinetFuser(Fuser):
 
     def counters(self) -> Mapping[str, int]:
         """Windows that lacked a sensor, that never came, and whose answer was no number."""
-        return dict(self._counts) if self._ready else {}
+        return {} if self._stream is None else dict(self._counts)
 
     def update(self, measurement: Measurement) -> list[NavState]:
         """Append the window's motion; the first call also gives the state at ``window.previous``.
 
         Raises:
             StateError: called before ``setup``.
-            DataError: an embedding of another length than the net was built for.
+            ConfigError: an embedding of another length than the net was built for.
         """
-        if not self._ready:
+        if self._stream is None:
             raise StateError("VinetFuser.update was called before setup(rig): set the fuser up first")
         window = measurement.window
         states = []
@@ -211,23 +228,29 @@ class VinetFuser(Fuser):
         elif self._chain.stamp_ns != window.previous.stamp_ns:
             # What it remembers is of another time.
             self._counts["missing windows"] += 1
-            self._state = None if self._state is None else self._state.rested()
+            self._stream.rest()
             self._chain.coast(window.previous.stamp_ns)
         embedding = self._embedding(measurement)
         self._account(window, seen=embedding is not None)
-        found = self._answer(embedding, window)
+        found = self._stream.answer(embedding, window)
         if found is None:
             self._counts["answers that are no numbers"] += 1
-            self._state = None
+            self._stream.forget()
             self._chain.coast(window.current.stamp_ns)
         else:
-            self._chain.follow(*found, window.current.stamp_ns, known=embedding is not None)
+            self._chain.follow(
+                found.motion,
+                found.covariance,
+                window.current.stamp_ns,
+                known=embedding is not None,
+                lasting=found.lasting,
+            )
         status: Status = "lost" if found is None or self._unseen_s > self._lost_after_s else "tracking"
         states.append(self._chain.state(status))
         return states
 
     def forward_batch(self, batch: "WindowBatch", upstream: "Mapping[str, Tensor]") -> "dict[str, Tensor]":
-        """Motions of all pairs of each window to learn from; of those that remember a whole window as answers.
+        """Motions of all pairs of each window.
 
         Args:
             batch: with inertial samples.
@@ -235,10 +258,8 @@ class VinetFuser(Fuser):
 
         Raises:
             ConfigError: no part before this one makes embeddings in training, or they have another length.
-            DataError: windows of fewer pairs than ``window``.
         """
-        from vioframe.learning.motion import inverse, product
-        from vioframe_vinet.net.seeing import moved_to, seen_in_batch
+        from vioframe_vinet.net.teaching import outputs_of_batch
 
         if EMBEDDING not in upstream:
             raise ConfigError(
@@ -246,54 +267,14 @@ class VinetFuser(Fuser):
                 "frontend=pair_encoder"
             )
         self._check_embedding(upstream[EMBEDDING].shape[-1])
-        if batch.pairs < self._options.window:
-            raise DataError(
-                f"windows have {batch.pairs} pairs of images, but fuser.window={self._options.window} needs as many"
-            )
         self._holder.taught()
-        learning = self.net.training
-        axes = self._axes(batch.rig.T_body_cam)
-        seen = seen_in_batch(
-            batch,
-            upstream[EMBEDDING],
-            axes,
-            intervals=self._options.imu_intervals,
-            lost_images=self._options.lost_images if learning else 0.0,
-            lost_imu=self._options.lost_imu if learning else 0.0,
-        )
-        answer, _ = self.net.get_submodule("core")(seen)
-        answered = answer.T_prev_cur[:, self._options.window - 1 :]
-        into_camera = product(inverse(batch.rig.T_body_cam), inverse(axes))[:, None]
-        named = {
-            "vector": answer.vector,
-            "motion": answer.T_prev_cur,
-            "T_prev_cur": moved_to(into_camera, answered),
-        }
-        if answer.log_variances is not None:
-            named["log_variances"] = answer.log_variances
-        if answer.sight is not None:
-            named |= {"sight": answer.sight.vector, "sight_log_variances": answer.sight.log_variances}
-            named["visible"] = seen.visible
-        return named
+        return outputs_of_batch(self.net, self._options, batch, upstream[EMBEDDING])
 
     def loss(self, outputs: "Mapping[str, Tensor]", batch: "WindowBatch") -> "dict[str, Tensor]":
-        """``loss``, and mean squared errors (rad², m²) of motions and of poses since the window began."""
-        from vioframe.learning.motion import product
-        from vioframe_vinet.net.core import CoreAnswer
-        from vioframe_vinet.net.gyro import Sight
-        from vioframe_vinet.net.loss import sight_loss
-        from vioframe_vinet.net.seeing import moved_to
+        """``loss``, and mean squared errors (rad², m²) of motions and of poses over ``window`` pairs."""
+        from vioframe_vinet.net.teaching import losses_of_batch
 
-        T_body_cam = batch.rig.T_body_cam
-        truth = moved_to(product(self._axes(T_body_cam), T_body_cam)[:, None], batch.T_prev_cur)
-        answer = CoreAnswer(outputs["motion"], outputs["vector"], None)
-        losses: dict[str, Tensor] = self.net.get_submodule("weighing")(answer, truth, outputs.get("log_variances"))
-        if "sight" in outputs:
-            sight = Sight(outputs["sight"], outputs["sight_log_variances"])
-            losses["sight"] = sight_loss(sight, outputs["visible"], truth)
-            losses["loss"] = losses["loss"] + losses["sight"]
-            losses["sight"] = losses["sight"].detach()
-        return losses
+        return losses_of_batch(self.net, self._options, outputs, batch)
 
     def _embedding(self, measurement: Measurement) -> Array | None:
         """What the images of a window show; None where one of them is missing."""
@@ -324,46 +305,6 @@ class VinetFuser(Fuser):
                 self._options.imu_intervals,
             )
             self._told_of_rate = True
-
-    def _answer(self, embedding: Array | None, window: SyncedWindow) -> tuple[Array, Array | None] | None:
-        """Motion (4, 4) of the body over a window and its covariance (6, 6); None if they are no numbers."""
-        import torch
-
-        from vioframe.learning.motion import covariance_from_log_variances
-        from vioframe_vinet.net.seeing import seen_in_window
-
-        options = self._options
-        with torch.inference_mode():
-            T_body_cam = torch.from_numpy(self._T_body_cam.astype(np.float32)).to(self._holder.device())
-            seen = seen_in_window(
-                window, embedding, self._axes(T_body_cam), size=options.embedding, intervals=options.imu_intervals
-            )
-            answer: CoreAnswer
-            answer, self._state = self.net.get_submodule("core")(seen, self._state)
-            motion = answer.T_prev_cur[0, 0].double().cpu().numpy()
-            covariance = None
-            if answer.log_variances is not None:
-                vector, spread = answer.vector[0, 0].double(), answer.log_variances[0, 0].double()
-                covariance = covariance_from_log_variances(vector, spread).cpu().numpy()
-        if not np.isfinite(motion).all() or (covariance is not None and not np.isfinite(covariance).all()):
-            return None
-        motion[:3, :3] = so3.normalise(motion[:3, :3])
-        if options.axes == "camera":
-            motion = self._T_body_cam @ motion @ se3.inverse(self._T_body_cam)
-            if covariance is not None:
-                into_body = se3.adjoint(self._T_body_cam)
-                covariance = into_body @ covariance @ into_body.T
-        return motion, covariance
-
-    def _axes(self, T_body_cam: "Tensor") -> "Tensor":
-        """T_axes_body (..., 4, 4) of the axes of the answer."""
-        import torch
-
-        from vioframe.learning.motion import inverse
-
-        if self._options.axes == "camera":
-            return inverse(T_body_cam)
-        return torch.eye(4, dtype=T_body_cam.dtype, device=T_body_cam.device).expand_as(T_body_cam)
 
     def _make_net(self) -> "nn.Module":
         from vioframe_vinet.net.assembly import make_net

@@ -1,5 +1,6 @@
 """The options of ``fuser=vinet``, checked."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -25,7 +26,8 @@ class NetOptions:
 
     Attributes:
         embedding: numbers that the front end gives for a pair of images.
-        window: pairs of a training window.
+        window: pairs of a training window, and those over which poses are composed.
+        settling: pairs of the windows from which the fuser learns by itself.
         imu_intervals: to which the inertial samples between two images are brought.
         imu_hidden, imu_layers: of the LSTM over them.
         hidden, layers: of the core's LSTM.
@@ -35,9 +37,11 @@ class NetOptions:
         rotation: added to the gyro's, or learned whole.
         gyro_bias_sigma: rad/s an axis, of the gyro's bias at first.
         gyro_memory: pairs after which what images said of it counts 1/e.
+        scale_memory: pairs after which 1/e is left of an error of lengths.
         feedback: what the core sees of its own answers.
         rotation_unit_rad, translation_unit_m: what an output of 1 means.
         loss: ``learned`` weights, or the ``likelihood`` of a Gaussian with the variances stated.
+        horizons: pairs over which errors are summed up for that likelihood.
         pose_weight: of the composed poses beside the motions.
         log_variance_rotation, log_variance_translation: from which learned weights start, ln rad² and ln m².
         lost_images, lost_imu: share of training windows in which a stretch of the sensor is left out.
@@ -48,6 +52,7 @@ class NetOptions:
 
     embedding: int
     window: int
+    settling: int
     imu_intervals: int
     imu_hidden: int
     imu_layers: int
@@ -59,10 +64,12 @@ class NetOptions:
     rotation: Rotation
     gyro_bias_sigma: float
     gyro_memory: int
+    scale_memory: int
     feedback: Feedback
     rotation_unit_rad: float
     translation_unit_m: float
     loss: Loss
+    horizons: Sequence[int]
     pose_weight: float
     log_variance_rotation: float
     log_variance_translation: float
@@ -71,10 +78,12 @@ class NetOptions:
 
     def __post_init__(self) -> None:
         sizes = ("embedding", "window", "imu_intervals", "imu_hidden", "imu_layers", "hidden", "layers", "joined")
-        for name in (*sizes, "gyro_memory"):
+        for name in (*sizes, "settling", "gyro_memory", "scale_memory"):
             value = getattr(self, name)
             if not isinstance(value, int) or value < 1:
                 raise ConfigError(f"fuser.{name} must be a whole number of 1 or more, got {value!r}")
+        if not self.horizons or not all(isinstance(pairs, int) and pairs > 0 for pairs in self.horizons):
+            raise ConfigError(f"fuser.horizons must be whole numbers of 1 or more, got {list(self.horizons)}")
         check_positive(
             "fuser",
             rotation_unit_rad=self.rotation_unit_rad,

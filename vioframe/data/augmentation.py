@@ -114,6 +114,21 @@ class Augmentation:
             "sensors": self.sensors.settings(),
         }
 
+    def mirror_only(self) -> "Augmentation":
+        """The same mirroring and nothing else."""
+        return Augmentation(
+            reverse=0.0,
+            mirror=self._mirror,
+            blur=0.0,
+            blur_sigma_px=self._sigmas,
+            salt_pepper=0.0,
+            salt_pepper_share=self._salt_pepper_share,
+            photometric=0.0,
+            brightness=self._brightness,
+            contrast=self._contrast,
+            gamma=self._gamma,
+        )
+
     def apply(self, window: TrainingWindow, rng: np.random.Generator) -> TrainingWindow:
         """A changed window; the one given is left as it is."""
         # Drawn in any case, so that switching one change off does not change the others.

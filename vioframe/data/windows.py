@@ -301,6 +301,11 @@ class WindowIndex:
         """Pairs of images of the shortest unbroken run that holds a window."""
         return min(len(run) for run in self._runs()) + self.pairs - 1
 
+    @property
+    def longest_run(self) -> int:
+        """Pairs of images of the longest unbroken run."""
+        return max(len(run) for run in self._runs()) + self.pairs - 1
+
     def _runs(self) -> Iterator[np.ndarray]:
         """Numbers of the windows of each unbroken run of images."""
         for recording in range(len(self.sequences)):

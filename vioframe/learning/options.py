@@ -15,8 +15,8 @@ _CHOICES = {
     "precision": ("auto", "32", "bf16", "16"),
 }
 
-# ``fusion`` has one in the second stage only, whose options it is part of.
-_WITHOUT_BEARING = ("cache", "resume", "workers", "fusion")
+# ``fusion`` and ``settling`` have one in a later stage only, whose options they are part of.
+_WITHOUT_BEARING = ("cache", "resume", "workers", "fusion", "settling")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +52,7 @@ class TrainerOptions:
         resume: file of a run that was stopped; None begins anew.
         augmentation: of the training windows.
         fusion: options that are others where a fuser is trained on what a VO answered.
+        settling: options that are others where a part is trained further by itself on longer windows; empty: none is.
 
     Raises:
         ConfigError: with the key and its value.
@@ -90,6 +91,7 @@ class TrainerOptions:
     resume: str | None
     augmentation: Augmentation
     fusion: Mapping[str, Any]
+    settling: Mapping[str, Any]
 
     def __post_init__(self) -> None:
         for name, allowed in _CHOICES.items():

@@ -9,7 +9,7 @@ import signal
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,8 @@ from vioframe.learning.module import TrainingModule
 from vioframe.learning.options import TrainerOptions
 from vioframe.learning.scoring import Score, mean_motion, score_motions
 from vioframe.learning.seeding import seed_everything
+from vioframe.learning.settling import FOLDER as SETTLED
+from vioframe.learning.settling import settling_options
 from vioframe.learning.weights import load_weights, read_card
 from vioframe.tracking import Tracker
 
@@ -105,7 +107,7 @@ def train_parts(
     about: Mapping[str, object],
     shown: bool,
 ) -> Trained:
-    """Train the parts together, and leave each with its best weights.
+    """Train the parts together, then those that wish it on longer windows, and leave each with its best weights.
 
     Args:
         parts: by slot, in the order of the pipeline.
@@ -121,8 +123,48 @@ def train_parts(
         DataError: recordings that are too short, or a resume file that does not fit.
         KeyboardInterrupt: the user stopped it; weights and resume file are those of the last epoch.
     """
-    context = max(part.context_pairs for part in parts.values())
     pairs = options.pairs or max(getattr(part, "training_pairs", None) or part.context_pairs for part in parts.values())
+    first = _train_together(
+        parts, training, validation, options, pairs, folder=folder, tracker=tracker, about=about, shown=shown
+    )
+    further = settling_options(
+        parts, list(first.weights), training.sequences, validation.sequences, options, pairs=pairs, folder=folder
+    )
+    if further is None:
+        return first
+    settled = _train_together(
+        parts,
+        training,
+        validation,
+        further,
+        further.pairs or pairs,
+        folder=folder / SETTLED,
+        tracker=tracker,
+        about=about,
+        shown=shown,
+    )
+    return replace(
+        settled if settled.weights else first,
+        weights={**first.weights, **settled.weights},
+        epochs=first.epochs + settled.epochs,
+        curve=[*first.curve, *settled.curve],
+    )
+
+
+def _train_together(
+    parts: Mapping[str, Trainable],
+    training: Split,
+    validation: Split,
+    options: TrainerOptions,
+    pairs: int,
+    *,
+    folder: Path,
+    tracker: Tracker,
+    about: Mapping[str, object],
+    shown: bool,
+) -> Trained:
+    """One stage, on windows of ``pairs`` pairs; arguments and errors as of :func:`train_parts`."""
+    context = max(part.context_pairs for part in parts.values())
     if pairs < context:
         log.warning("trainer.pairs=%d is less than the %d pairs that one answer takes, which are taken", pairs, context)
     train_index = WindowIndex(training.sequences, max(pairs, context), split="training")

@@ -72,7 +72,8 @@ def provide_weights(
         slots = [slot for slot in untrained if learns_from_answers(nets[slot]) == answers]
         if slots:
             together = [slot for slot, part in nets.items() if learns_from_answers(part) == answers]
-            _Stage(config, choices, slots, together, answers=answers).provide(tested, shown=shown)
+            settles = any(getattr(nets[slot], "settling_pairs", None) for slot in slots)
+            _Stage(config, choices, slots, together, answers=answers, settles=settles).provide(tested, shown=shown)
 
 
 def _with_nets(pipeline: Pipeline) -> dict[str, Trainable]:
@@ -89,6 +90,7 @@ class _Stage:
         slots: of the parts that need weights.
         together: of all parts that take part.
         answers: whether they learn from what a VO answers.
+        settles: whether one of them is trained further by itself.
     """
 
     config: DictConfig
@@ -96,6 +98,7 @@ class _Stage:
     slots: Sequence[str]
     together: Sequence[str]
     answers: bool
+    settles: bool
 
     @property
     def told(self) -> str:
@@ -157,6 +160,8 @@ class _Stage:
         # Other parts take no part in a training, but for what they answered, which the splits bring.
         used = {slot: bearing_of(self.config, slot) for slot in self.together}
         words = [__version__, options.settings(), used, [split.hashes for split in splits]]
+        if self.settles:
+            words.append(dict(options.settling))
         return hashlib.sha256(json.dumps(words, sort_keys=True, default=str).encode()).hexdigest()
 
     def _train(
@@ -193,7 +198,8 @@ class _Stage:
         partial.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
         os.replace(partial, place / _RESULT)
         # It is of no more use, and three times as large as the weights.
-        resume.unlink(missing_ok=True)
+        for spent in place.rglob(resume.name):
+            spent.unlink()
         return found
 
 

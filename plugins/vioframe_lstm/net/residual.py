@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from vioframe.learning.likelihood import accumulated_likelihood
 from vioframe_lstm.features import FEATURES
 from vioframe_lstm.net.causal import CausalNet, Memory
 from vioframe_lstm.net.gyros import GyroRecord
-from vioframe_lstm.net.likelihood import accumulated_likelihood
 
 ANSWERS = 12
 """Numbers that the net answers: gains of the three components of a shift, additions to them, ln of variances."""

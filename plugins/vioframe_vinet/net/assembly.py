@@ -3,7 +3,7 @@
 from torch import nn
 
 from vioframe_vinet.net.core import VinetCore
-from vioframe_vinet.net.loss import PoseErrors, PoseLikelihood
+from vioframe_vinet.net.loss import AccumulatedLikelihood, PoseErrors
 from vioframe_vinet.options import NetOptions
 
 
@@ -22,6 +22,7 @@ def make_net(options: NetOptions) -> nn.Module:
         gyro_turns=options.rotation == "gyro",
         gyro_bias_sigma=options.gyro_bias_sigma,
         gyro_memory=options.gyro_memory,
+        scale_memory=options.scale_memory,
         feed_back_pose=options.feedback == "pose",
         rotation_unit_rad=options.rotation_unit_rad,
         translation_unit_m=options.translation_unit_m,
@@ -34,10 +35,5 @@ def make_net(options: NetOptions) -> nn.Module:
     )
     weighing: nn.Module = means
     if options.loss == "likelihood":
-        weighing = PoseLikelihood(
-            means,
-            rotation_unit_rad=options.rotation_unit_rad,
-            translation_unit_m=options.translation_unit_m,
-            pose_weight=options.pose_weight,
-        )
+        weighing = AccumulatedLikelihood(means, horizons=options.horizons, scale_memory=options.scale_memory)
     return nn.ModuleDict({"core": core, "weighing": weighing})

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from vioframe.learning.motion import exp_so3, from_parts, log_so3, product
 from vioframe_vinet.net.gyro import USUAL_S, Bias, GyroCheck, Sight
 from vioframe_vinet.net.inertial import InertialEncoder, Resampled, turn_by_gyro
+from vioframe_vinet.net.lasting import Lasting, LastingScale
 
 _MOTION = 6
 # In squared units of the output: one sample known to 2.5 thousandths of a unit must not outweigh all others.
@@ -67,13 +68,16 @@ class CoreAnswer(NamedTuple):
     Attributes:
         T_prev_cur: (B, S, 4, 4) motions.
         vector: (B, S, 6) the same as (rotation vector rad, translation m).
-        log_variances: (B, S, 6) natural logarithms of rad² and m², of the vector's errors, or None.
+        log_variances: (B, S, 6) natural logarithms of rad² and m², of what is new in the vector's errors each time, or
+            None.
+        lasting: what its errors share with those of other pairs, or None.
         sight: the rotation that images alone show, or None.
     """
 
     T_prev_cur: Tensor
     vector: Tensor
     log_variances: Tensor | None
+    lasting: Lasting | None = None
     sight: Sight | None = None
 
 
@@ -111,6 +115,7 @@ class VinetCore(nn.Module):
         gyro_turns: bool,
         gyro_bias_sigma: float,
         gyro_memory: int,
+        scale_memory: int,
         feed_back_pose: bool,
         rotation_unit_rad: float,
         translation_unit_m: float,
@@ -129,6 +134,7 @@ class VinetCore(nn.Module):
                 with the translation alone.
             gyro_bias_sigma: rad/s an axis, of that bias at first.
             gyro_memory: pairs after which what images said counts 1/e.
+            scale_memory: pairs after which 1/e is left of an error of the lengths.
             feed_back_pose: let the core see the pose since it began to remember.
             rotation_unit_rad, translation_unit_m: what an output of 1 means.
         """
@@ -152,6 +158,7 @@ class VinetCore(nn.Module):
         self.joined = nn.Sequential(nn.Dropout(dropout), nn.Linear(hidden, joined), nn.ReLU(inplace=True))
         self.answer = nn.Linear(joined, 3 if gyro_turns else _MOTION)
         self.spread = nn.Linear(joined + (3 if gyro_turns else 0), _MOTION) if log_variances else None
+        self.scale = LastingScale(scale_memory) if log_variances else None
         # At first close to no motion, whatever it sees.
         nn.init.normal_(self.answer.weight, std=0.1 * joined**-0.5)
         nn.init.zeros_(self.answer.bias)
@@ -195,10 +202,12 @@ class VinetCore(nn.Module):
             answers.append(answer)
             state = state._replace(T_first_prev=product(pose, answer.T_prev_cur[:, 0]))
         variances = [each.log_variances for each in answers if each.log_variances is not None]
+        lasting = [each.lasting for each in answers if each.lasting is not None]
         whole = CoreAnswer(
             torch.cat([each.T_prev_cur for each in answers], dim=1),
             torch.cat([each.vector for each in answers], dim=1),
             torch.cat(variances, dim=1) if variances else None,
+            Lasting(*(torch.cat(parts, dim=1) for parts in zip(*lasting, strict=True))) if lasting else None,
             sight,
         )
         return whole, state
@@ -208,20 +217,27 @@ class VinetCore(nn.Module):
         # Single precision even where the layers before ran in half: a rotation of 0.01° would not survive that.
         numbers = self.answer(features).float()
         known = features.detach()
+        lasting = None if self.scale is None else self.scale(rotations.visible)
+        unit = math.log(self._units[0])
         if self.gyro is None or rotations.sight is None or state.bias is None:
             R = exp_so3(self._units[0] * numbers[..., :3])
         else:
             sight = rotations.sight
             checked = rotations.heard & rotations.visible
-            correction, variance, bias = self.gyro(rotations.turns, sight, checked, rotations.duration_s, state.bias)
+            found, bias = self.gyro(rotations.turns, sight, checked, rotations.duration_s, state.bias)
             heard = rotations.heard[..., None]
             seen = torch.where(rotations.visible[..., None], sight.vector, torch.zeros_like(sight.vector))
-            R = product(rotations.turns, exp_so3(torch.where(heard, correction, seen)))
-            stated = torch.where(heard, variance.log(), sight.log_variances)
-            # Of the order of 1.
-            told = 0.2 * (stated.detach() - 2.0 * math.log(self._units[0]))
+            R = product(rotations.turns, exp_so3(torch.where(heard, found.correction, seen)))
+            # Whose rotation it is, and where it is the images', how good: of the order of 1.
+            told = torch.where(heard, torch.ones_like(seen), 0.2 * (sight.log_variances.detach() - 2.0 * unit))
             known = torch.cat([known, told.to(known.dtype)], dim=-1)
             state = state._replace(bias=bias)
+            if lasting is not None:
+                of_sight = (self.gyro.lasting_variance / USUAL_S**2).expand_as(found.variance)
+                lasting = lasting.joined(
+                    torch.where(heard, found.variance, of_sight),
+                    torch.where(heard, found.kept, torch.zeros_like(found.kept)),
+                )
         p = self._units[1] * numbers[..., -3:]
         # What is learned of errors must not bend what is learned of motions: the larger gradient is that of variances.
         variances = None
@@ -229,4 +245,4 @@ class VinetCore(nn.Module):
             limited = self.spread(known).float().clamp(-_LARGEST_LOG_VARIANCE, _LARGEST_LOG_VARIANCE)
             variances = limited + 2.0 * limited.new_tensor([self._units[0]] * 3 + [self._units[1]] * 3).log()
         vector = torch.cat([log_so3(R), p], dim=-1)
-        return CoreAnswer(from_parts(R, p), vector, variances, rotations.sight), state
+        return CoreAnswer(from_parts(R, p), vector, variances, lasting, rotations.sight), state

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from vioframe.learning.batch import WindowBatch
 
 
+# Pairs of images: a sensor that has to be missed for longer teaches nothing new.
+_LONGEST = 50
+
+
 def seen_in_window(
     window: SyncedWindow, embedding: Array | None, T_axes_body: Tensor, *, size: int, intervals: int
 ) -> Seen:
@@ -89,7 +93,7 @@ def stretches(windows: int, pairs: int, share: float) -> Tensor:
         return torch.zeros(windows, pairs, dtype=torch.bool)
     chosen = torch.rand(windows) < share
     first = (torch.rand(windows) * pairs).long()
-    length = 1 + (torch.rand(windows) * (pairs - first)).long()
+    length = 1 + (torch.rand(windows) * (pairs - first).clamp_max(_LONGEST)).long()
     place = torch.arange(pairs)[None]
     return chosen[:, None] & (place >= first[:, None]) & (place < (first + length)[:, None])
 

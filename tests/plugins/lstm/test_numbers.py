@@ -15,10 +15,10 @@ from filter_runs import play, record, simulated
 from vioframe.data.simulator import ImuSettings
 from vioframe.errors import ConfigError, DataError, StateError
 from vioframe.geometry import se3, so3
+from vioframe.learning.likelihood import accumulated_likelihood
 from vioframe.learning.weights import save_weights
 from vioframe_lstm import LstmFuser, PoseOptions, ResidualOptions
 from vioframe_lstm.net.gyros import GyroRecord
-from vioframe_lstm.net.likelihood import accumulated_likelihood
 from vioframe_lstm.options import Unstated
 from vioframe_lstm.pairs import attitudes, doubles, pairs_of_batch
 from vioframe_lstm.stack import sample_paths, window_stack

@@ -9,8 +9,12 @@ import pytest
 pytest.importorskip("torch", reason="needs torch: pip install 'vioframe[learn]'")
 pytest.importorskip("lightning", reason="needs lightning: pip install 'vioframe[learn]'")
 
+import torch
+
 from learned_parts import options
 from learned_scenes import stored
+from vioframe.data.windows import cut_window
+from vioframe.learning.batch import collate
 from vioframe.learning.seeding import seed_everything
 from vioframe.learning.training import Split, train_parts
 from vioframe.testing import make_scene
@@ -33,18 +37,23 @@ def small(name):
     return dataclasses.replace(whole, images=images[..., None])
 
 
-def test_both_parts_are_trained_together_and_keep_their_weights(tmp_path):
+def test_both_parts_are_trained_together_then_the_fuser_alone_and_keep_their_weights(tmp_path):
     chosen = options(
         tmp_path,
         max_epochs=2,
         epoch_windows=8,
         size_px=list(SIZE),
         augmentation={"reverse": 0.5, "mirror": 0.5},
+        settling={"max_epochs": 1, "epoch_windows": 4, "batch_size": 2},
     )
     seed_everything(0)
     splits = (Split(sequences=(small(name),), hashes=(name,)) for name in ("training", "validation"))
     trained = train_parts(parts(), *splits, chosen, folder=tmp_path, tracker=NullTracker(), about={}, shown=False)
-    assert set(trained.weights) == {"frontend", "fuser"}
+    assert {slot: path.parent.parent.name for slot, path in trained.weights.items()} == {
+        "frontend": tmp_path.name,
+        "fuser": "settled",
+    }
+    assert trained.epochs == len(trained.curve) == 3
     assert trained.score is not None and np.isfinite(trained.score.t_rel_percent)
     used = parts(**{slot: str(path) for slot, path in trained.weights.items()})
     scene = make_scene()
@@ -57,3 +66,22 @@ def test_both_parts_are_trained_together_and_keep_their_weights(tmp_path):
         states += used["fuser"].update(Measurement(window=window, features=used["frontend"].process(window.current)))
     assert len(states) == len(scene.frames)
     assert all(np.linalg.eigvalsh(state.covariance).min() > 0.0 for state in states)
+
+
+def test_a_frozen_encoder_encodes_a_pair_once(tmp_path):
+    front = parts()["frontend"]
+    front.net.eval().requires_grad_(False)
+    batch = collate([cut_window(small("some"), start, 4) for start in (0, 2)]).as_float()
+    expected = PairEncoder.forward_batch(front, batch, {})["embedding"]
+    asked = []
+    encoder = front.net.get_submodule("encoder")
+    encoder.register_forward_hook(lambda module, args, output: asked.append(len(args[0])))
+    assert torch.equal(front.forward_batch(batch, {})["embedding"], expected) and not asked
+    one = front.forward_batch(collate([cut_window(small("some"), 1, 6)]).as_float(), {})["embedding"]
+    assert torch.equal(one[0, 1:5], expected[1]) and asked == [1]
+    front.net.requires_grad_(True)
+    torch.testing.assert_close(front.forward_batch(batch, {})["embedding"], expected)
+    # Other weights, other answers.
+    front.net.requires_grad_(False)
+    encoder.join.bias.add_(0.5)
+    assert not torch.allclose(front.forward_batch(batch, {})["embedding"], expected, atol=1e-2)
