@@ -6,12 +6,15 @@ is not a field of any of these, so that no estimator can read it by accident.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from vioframe.checks import Array, Stamps, check_array, check_increasing, check_pose
 from vioframe.errors import ShapeError
+
+if TYPE_CHECKING:
+    from vioframe.vision.keypoints import Keypoints
 
 Image = np.ndarray
 Status = Literal["starting", "tracking", "lost"]
@@ -259,6 +262,7 @@ class VisualFeatures:
             among those of ``tracks``. None where the front end looks at one camera only.
         flow: (H, W, 2) px from the previous image to this one, or None.
         embedding: (D,) or None.
+        untracked: described points of camera 0 that nobody follows, by which a place may be known again, or None.
         extras: fields a third party adds, by the name it puts in ``provides``.
     """
 
@@ -267,6 +271,7 @@ class VisualFeatures:
     stereo: Tracks | None = None
     flow: Array | None = None
     embedding: Array | None = None
+    untracked: "Keypoints | None" = None
     extras: Mapping[str, object] = field(default_factory=dict)
 
 

@@ -302,7 +302,7 @@ class WindowFuser(TightFuser):
             self._count("windows solved again")
         self._continue()
         if self._relocalisation is not None and step.window.current.images:
-            self._relocalisation.take_keyframe(step.window.current.images[0], step.tracks)
+            self._relocalisation.take_keyframe(step.window.current.images[0], step.tracks, step.untracked)
         return Support(
             used=max(sum(len(rows) for rows in observed.values()) + len(new.ids), far),
             refused=refused + new.refused,

@@ -8,6 +8,7 @@ import numpy as np
 from vioframe.checks import Array, Stamps
 from vioframe.geometry import camera as projection
 from vioframe.types import Camera, Image, Tracks
+from vioframe.vision.keypoints import Keypoints
 
 BYTES = 32
 """Length of a descriptor: 256 comparisons."""
@@ -68,21 +69,17 @@ class Describer:
         self._orb = cv2.ORB.create(nfeatures=100_000, nlevels=1, edgeThreshold=_BORDER_PX)
         self._planes: Array | None = None
 
-    def describe(self, image: Image, tracks: Tracks, down_cam: Array) -> Appearance:
+    def describe(self, image: Image, tracks: Tracks, down_cam: Array, untracked: Keypoints | None = None) -> Appearance:
         """Corners of an image.
 
         Args:
             image: (H, W) or (H, W, 3).
             tracks: points followed in it.
             down_cam: (3,) direction of gravity in the camera.
+            untracked: points of the image beside them, where the front end describes such.
         """
         if tracks.descriptors is not None and len(tracks):
-            return Appearance(
-                ids=tracks.ids,
-                pixels=tracks.pixels,
-                bearings=tracks.bearings,
-                descriptors=self._binary(tracks.descriptors),
-            )
+            return self._as_described(tracks, tracks.descriptors, untracked)
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         extra = self._detect(grey, tracks.pixels)
         ids = np.concatenate([tracks.ids, np.full(len(extra), NO_TRACK, dtype=np.int64)])
@@ -100,6 +97,20 @@ class Describer:
             pixels=pixels[kept],
             bearings=bearings[kept],
             descriptors=np.zeros((0, BYTES), np.uint8) if descriptors is None else descriptors,
+        )
+
+    def _as_described(self, tracks: Tracks, descriptors: np.ndarray, untracked: Keypoints | None) -> Appearance:
+        """By the front end's own descriptors, of the tracks and of the strongest points beside them."""
+        if untracked is None or not len(untracked) or not self._corners:
+            return Appearance(
+                ids=tracks.ids, pixels=tracks.pixels, bearings=tracks.bearings, descriptors=self._binary(descriptors)
+            )
+        extra = untracked.select(np.argsort(-untracked.scores, kind="stable")[: self._corners])
+        return Appearance(
+            ids=np.concatenate([tracks.ids, np.full(len(extra), NO_TRACK, dtype=np.int64)]),
+            pixels=np.concatenate([tracks.pixels, extra.pixels]),
+            bearings=np.concatenate([tracks.bearings, projection.bearings(self._camera, extra.pixels)]),
+            descriptors=self._binary(np.concatenate([descriptors, extra.descriptors])),
         )
 
     def _detect(self, grey: Image, taken: Array) -> Array:

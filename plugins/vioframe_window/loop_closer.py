@@ -109,7 +109,7 @@ class BowLoop(LoopCloser):
         if self._is_near_the_last(keyframe.T_world_body):
             return None
         down_cam = -(keyframe.T_world_body[:3, :3] @ T_body_cam[:3, :3])[2]
-        seen = self._describer.describe(keyframe.image, keyframe.tracks, down_cam)
+        seen = self._describer.describe(keyframe.image, keyframe.tracks, down_cam, keyframe.untracked)
         node = trajectory.add(keyframe.stamp_ns, keyframe.T_world_body, broken=self._interrupted)
         self._interrupted = False
         match = self._find(keyframe, T_body_cam, seen, node)

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 
 from vioframe.checks import Array, Stamps
 from vioframe.types import Image, SensorRig, Tracks, Trajectory
+from vioframe.vision.keypoints import Keypoints
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,6 +39,7 @@ class LoopKeyframe:
             among ``tracks.ids`` are not used.
         landmarks_world: (L, 3) m, the same points in the odometry frame.
         T_body_cam: (4, 4) of camera 0 as estimated, or None for the rig's.
+        untracked: points of the image beside the tracks, of the same kind of descriptors, or None.
     """
 
     stamp_ns: int
@@ -47,6 +49,7 @@ class LoopKeyframe:
     landmark_ids: Stamps
     landmarks_world: Array
     T_body_cam: Array | None = None
+    untracked: Keypoints | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

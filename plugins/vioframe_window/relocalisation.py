@@ -7,6 +7,7 @@ import numpy as np
 from vioframe.checks import Array
 from vioframe.geometry import se3
 from vioframe.types import Image, NavState, Tracks
+from vioframe.vision.keypoints import Keypoints
 from vioframe_window.loop_interface import LoopCloser, LoopKeyframe
 from vioframe_window.smoother import Smoother
 
@@ -29,12 +30,13 @@ class Relocalisation:
         self._open.clear()
         self._closer.interrupt()
 
-    def take_keyframe(self, image: Image, tracks: Tracks) -> None:
+    def take_keyframe(self, image: Image, tracks: Tracks, untracked: Keypoints | None) -> None:
         """Hand over the newest keyframe, and what the window now thinks of those before.
 
         Args:
             image: of camera 0 at the newest keyframe.
             tracks: of the same.
+            untracked: described points of the same beside them, or None.
         """
         smoother = self._smoother
         by_stamp = {keyframe.stamp_ns: keyframe.T_world_body for keyframe in smoother.keyframes}
@@ -52,6 +54,7 @@ class Relocalisation:
                 T_world_body=smoother.newest.T_world_body,
                 image=image,
                 tracks=tracks,
+                untracked=untracked,
                 landmark_ids=smoother.point_ids,
                 landmarks_world=smoother.points_world,
                 T_body_cam=smoother.T_body_cam,

@@ -259,6 +259,7 @@ class TightFuser(Fuser):
             tracks=Tracks.none() if features is None or features.tracks is None else features.tracks,
             stereo=features.stereo if features is not None and self._uses_stereo else None,
             at_rest=at_rest,
+            untracked=None if features is None else features.untracked,
         )
 
     def _cross_hole(self, window: SyncedWindow) -> None:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from vioframe.checks import Array
 from vioframe.types import ImuNoise, InertialDelta, Measurement, NavState, SyncedWindow, Tracks
+from vioframe.vision.keypoints import Keypoints
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,6 +41,7 @@ class Step:
         noise: densities that the samples of the window are believed with, holes apart.
         tracks: points in camera 0 at ``window.current``; empty where no image came.
         stereo: the same points in camera 1, as far as found, or None.
+        untracked: described points of camera 0 beside the tracks, or None.
         at_rest: the body seems to stand still.
     """
 
@@ -49,6 +51,7 @@ class Step:
     tracks: Tracks
     stereo: Tracks | None
     at_rest: bool
+    untracked: Keypoints | None = None
 
     @property
     def stamp_ns(self) -> int:

@@ -134,7 +134,8 @@ class DescriptorFrontend(Frontend):
             descriptors=points.descriptors,
         )
         stereo = self._match_stereo(tracks, self._pair, points, keypoints[1]) if self._pair is not None else None
-        return VisualFeatures(frame=frame, tracks=tracks, stereo=stereo)
+        rest = np.setdiff1d(np.arange(len(keypoints[0])), index)
+        return VisualFeatures(frame=frame, tracks=tracks, stereo=stereo, untracked=keypoints[0].select(rest))
 
     def _calibrated(self) -> Camera:
         if self._camera is None:
