@@ -36,6 +36,8 @@ _NO_BEARING = (
     "trainer",
     "training_data",
 )
+# Characters of what is told of a failed cell.
+_LONGEST_ERROR = 400
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +68,13 @@ class CellResult:
 def failed(error: BaseException, key: str = "") -> CellResult:
     """A cell that an error ended."""
     text = str(error) if isinstance(error, VioframeError) else f"{type(error).__name__}: {error}"
-    return CellResult(key=key, status="failed", error=text.strip().partition("\n")[0])
+    return CellResult(key=key, status="failed", error=_one_line(text))
+
+
+def _one_line(text: str) -> str:
+    """What libraries say over several lines, a cell of a table says in one."""
+    words = " ".join(text.split())
+    return words if len(words) <= _LONGEST_ERROR else words[: _LONGEST_ERROR - 1] + "…"
 
 
 def cell_key(config: DictConfig) -> str:
@@ -150,7 +158,7 @@ def run_cell(config: DictConfig, choices: Mapping[str, str], key: str) -> CellRe
                 if isinstance(stop, KeyboardInterrupt):
                     raise stop
                 if run.error is not None:
-                    return CellResult(key=key, status="failed", error=f"{name}: {run.error}")
+                    return CellResult(key=key, status="failed", error=_one_line(f"{name}: {run.error}"))
                 rows.append(evaluate_run(run, options))
                 recorder.discard_partial()
     except Exception as error:  # noqa: BLE001 - one cell must not end a study; its error is told in the table

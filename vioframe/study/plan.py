@@ -47,7 +47,7 @@ class Study:
         conditions: lists of overrides by name, instead of the values of one option; empty for none.
         values: of that option; or names of those conditions that are run, None for all.
         reference: the value or condition that all others are compared with.
-        axis: what is varied, with its unit, as it stands below the curves.
+        axis: what is varied, with its unit, as it stands below the curves; None takes the key.
         factor: values times this are shown.
         base: overrides of all variants, such as ``dataset=simulated_car``; what the command line says comes after.
         more: further overrides of all variants: the command line cannot name options that only they have.
@@ -79,7 +79,7 @@ class Study:
         conditions: Mapping[str, Sequence[str]],
         values: Sequence[Value] | None,
         reference: Value,
-        axis: str,
+        axis: str | None,
         factor: float,
         base: Sequence[str],
         more: Sequence[str],
@@ -98,7 +98,7 @@ class Study:
         again: bool,
         cells: str,
     ) -> None:
-        self.name, self.title, self.axis = name, title, axis
+        self.name, self.title = name, title
         self.conditions = {str(name): _texts(texts) for name, texts in _named("conditions", conditions).items()}
         self.key = "" if key is None else str(key)
         if bool(self.key) == bool(self.conditions):
@@ -115,6 +115,8 @@ class Study:
         else:
             self.reference = _numbers("reference", [reference])[0]
             self._all = [*sorted({*_numbers("values", values), self.reference})]
+        # conf/study/custom.yaml calls the axis by the key, which conditions have none of.
+        self.axis = self.varied if axis is None else str(axis)
         self.factor = _numbers("factor", [factor])[0]
         self.base = [str(text) for text in base]
         self.more = [str(text) for text in more]

@@ -65,6 +65,13 @@ def test_what_goes_wrong_is_a_sentence(overrides, match):
     assert match.replace("\\", "") in result.error and "\n" not in result.error
 
 
+def test_what_a_library_says_over_many_lines_becomes_one():
+    assert failed(RuntimeError("\nIndeterminate system\n\nThrown when ...")).error == (
+        "RuntimeError: Indeterminate system Thrown when ..."
+    )
+    assert len(failed(RuntimeError("word " * 1000)).error) == 400
+
+
 def test_store_keeps_what_finished_and_takes_damage_for_nothing(tmp_path):
     store = CellStore(tmp_path / "cells")
     assert store.find("one") is None
