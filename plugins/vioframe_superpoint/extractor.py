@@ -84,6 +84,7 @@ class SuperPointExtractor:
             spread=spread,
             refinement=refinement,
             refinement_px=refinement_px,
+            slot=slot,
         )
         self._encoder = encoder
         self._half = half

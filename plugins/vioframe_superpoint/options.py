@@ -56,6 +56,7 @@ class Detection:
         spread: choose strong ones and empty parts of the image first; otherwise the strongest.
         refinement: heat, gradient or none.
         refinement_px: half side of the window in which a point is placed.
+        slot: what the user calls the part, for messages.
 
     Raises:
         ConfigError: with the key and its value.
@@ -69,6 +70,7 @@ class Detection:
     spread: bool
     refinement: Refinement
     refinement_px: int
+    slot: str
 
     def __post_init__(self) -> None:
         for name, good, rule in (
@@ -81,4 +83,4 @@ class Detection:
             ("refinement_px", 1 <= self.refinement_px <= 20, "from 1 to 20"),
         ):
             if not good:
-                raise ConfigError(f"frontend.{name} must be {rule}, got {getattr(self, name)!r}")
+                raise ConfigError(f"{self.slot}.{name} must be {rule}, got {getattr(self, name)!r}")
