@@ -1,5 +1,6 @@
 """From an instant to the images of the rig: the world, the light, the shutter and the sensor."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,13 +17,19 @@ from vioframe.data.simulator.rooms import PATH_STEP_S, build_room
 from vioframe.data.simulator.street import build_street
 from vioframe.data.simulator.texture import Atlas
 from vioframe.data.simulator.world import World, WorldPlan
+from vioframe.geometry import se3, so3
 from vioframe.types import Camera
 
 # Photo-electrons of a full pixel, and noise of the read-out in grey values, of a small global-shutter sensor at
 # high gain: they set how much noise low light brings.
 _FULL_WELL = 2000.0
 _READ_NOISE_DN = 1.5
-_BLUR_SAMPLES = 7
+# An exposure is averaged in steps of at most so many pixels, of a scene at this distance; a picture is smooth enough
+# for that, and fewer steps would show as ghosts of its edges. What moves by itself is not known beforehand.
+_BLUR_STEP_PX = 2.0
+_BLUR_DISTANCE_M = 2.0
+_BLUR_MOST = 16
+_BLUR_OF_OBJECTS = 7
 
 
 def build_world(plan: PlannedMotion, seed: int, duration_s: float, degradations: Degradations) -> WorldPlan:
@@ -139,12 +146,23 @@ class Imager:
         if exposure_s == 0.0:
             return self.view(t_s, camera).grey
         # The stamp is the middle of the exposure.
-        offsets = (np.arange(_BLUR_SAMPLES) + 0.5) / _BLUR_SAMPLES - 0.5
-        total = self.view(t_s + offsets[0] * exposure_s, camera).grey
+        count = self._blur_steps(camera, t_s)
+        offsets = ((np.arange(count) + 0.5) / count - 0.5) * exposure_s
+        total = self.view(t_s + offsets[0], camera).grey
         for offset in offsets[1:]:
-            total = total + self.view(t_s + offset * exposure_s, camera).grey
-        mean: np.ndarray = total / np.float32(_BLUR_SAMPLES)
+            total = total + self.view(t_s + offset, camera).grey
+        mean: np.ndarray = total / np.float32(count)
         return mean
+
+    def _blur_steps(self, camera: int, t_s: float) -> int:
+        """Instants that an exposure around ``t_s`` is averaged over, by how far the picture moves meanwhile."""
+        model, half_s = self._cameras[camera], 0.5 * self._degradations.motion_blur_s
+        ends = self._motion.evaluate(np.array([t_s - half_s, t_s + half_s])).T_world_body @ model.T_body_cam
+        between = se3.inverse(ends[0]) @ ends[1]
+        shift = float(np.linalg.norm(between[:3, 3])) / _BLUR_DISTANCE_M
+        moved_px = float(model.intrinsics_px[0]) * (float(so3.angle(between[:3, :3])) + shift)
+        least = _BLUR_OF_OBJECTS if self._degradations.moving_objects else 1
+        return min(max(math.ceil(moved_px / _BLUR_STEP_PX), least), _BLUR_MOST)
 
     def _expose(self, grey: np.ndarray, camera: int, t_s: float) -> np.ndarray:
         """What the sensor makes of the light: gain, noise, eight bits."""

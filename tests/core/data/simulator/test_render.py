@@ -282,6 +282,23 @@ def test_degradations_do_what_they_say() -> None:
     assert noise_of[1] > 2.0 * noise_of[0]
 
 
+def test_blur_is_the_mean_over_the_exposure_whatever_the_motion() -> None:
+    settings = CameraSettings(size_px=(376, 240), noise_dn=0.0)
+
+    def opened(blur_s: float):  # type: ignore[no-untyped-def]
+        spoilt = Degradations(motion_blur_s=blur_s)
+        dataset = SimulatedDataset(sequence="walk", duration_s=10.0, camera=settings, degradations=spoilt)
+        return dataset.open("walk-0").imager
+
+    clear, blurred = opened(0.0), opened(0.04)
+    # At rest there is nothing to blur.
+    np.testing.assert_array_equal(blurred.images(1.0)[0], clear.images(1.0)[0])
+    for t_s in (5.0, 7.0):
+        dense = np.mean([clear.view(t_s + offset).grey for offset in np.linspace(-0.0195, 0.0195, 40)], axis=0)
+        error = np.abs(blurred.images(t_s)[0].astype(float) - np.clip(dense, 0.0, 255.0))
+        assert np.mean(error) < 1.0 and np.percentile(error, 99) < 6.0
+
+
 def test_moving_objects_move_while_the_camera_stands() -> None:
     # The first two seconds are at rest; only what moves by itself can change the picture.
     spoilt = Degradations(moving_objects=6)
