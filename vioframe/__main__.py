@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("vioframe")
 
-TASKS = ("experiment", "train", "study", "evaluate", "doctor", "matrix", "plugins", "model_card")
+TASKS = ("experiment", "train", "study", "evaluate", "evaluate_features", "doctor", "matrix", "plugins", "model_card")
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells have it: 128 + SIGINT."""
 

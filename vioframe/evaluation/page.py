@@ -12,7 +12,7 @@ def render_page(title: str, body: Iterable[str]) -> str:
 
 
 def image_tag(title: str, path: Path, *, width: str = "full") -> str:
-    """A PNG file inside the page.
+    """A PNG or JPEG file inside the page.
 
     Args:
         title: read out where the image cannot be seen.
@@ -20,7 +20,8 @@ def image_tag(title: str, path: Path, *, width: str = "full") -> str:
         width: ``full``, ``large`` or ``half``.
     """
     data = base64.b64encode(path.read_bytes()).decode("ascii")
-    return f"<img class={width} alt='{escape(title, quote=True)}' src='data:image/png;base64,{data}'>"
+    kind = "jpeg" if path.suffix == ".jpg" else "png"
+    return f"<img class={width} alt='{escape(title, quote=True)}' src='data:image/{kind};base64,{data}'>"
 
 
 _STYLE = """
