@@ -13,7 +13,7 @@ from vioframe.data.simulator.render import Renderer
 from vioframe.data.simulator.texture import Atlas, to_grey
 from vioframe.data.simulator.world import World
 from vioframe.pictures.lighting import change_light
-from vioframe.pictures.sources import COMMON_LIGHT, check_size
+from vioframe.pictures.sources import COMMON_LIGHT, TRIES, check_size, shows_something
 from vioframe.types import Camera, Image
 
 # Streets are cheap to build and differ most.
@@ -63,8 +63,12 @@ class RenderedPlaces:
         if self._place is None or self._place.number != number:
             world_seed = int(np.random.default_rng([self._seed, self._tag, number]).integers(2**31)) + _FIRST_WORLD
             self._place = _Place(number, world_seed, self._size_px)
-        rng = np.random.default_rng([self._seed, self._tag, number, index])
-        return change_light(self._place.view(rng), rng, COMMON_LIGHT)
+        for attempt in range(TRIES):
+            rng = np.random.default_rng([self._seed, self._tag, number, index, attempt])
+            view = self._place.view(rng)
+            if shows_something(view):
+                break
+        return change_light(view, rng, COMMON_LIGHT)
 
 
 class _Place:
@@ -99,7 +103,7 @@ class _Place:
         renderer = self._renderers[int(rng.integers(len(self._renderers)))]
         grey = renderer.render(self._pose(rng)).grey
         # Towards a mean that an automatic exposure would reach.
-        gain = rng.uniform(70.0, 150.0) / max(float(grey.mean()), 10.0)
+        gain = rng.uniform(80.0, 160.0) / max(float(grey.mean()), 10.0)
         return to_grey(grey * np.float32(np.clip(gain, 0.5, 2.0)))
 
     def _pose(self, rng: np.random.Generator) -> Array:

@@ -330,6 +330,6 @@ def paint_scene(name: str, size_px: tuple[int, int], bank: TextureBank, rng: np.
     painter = PatchPainter(size_px, focal_px, bank, rng)
     painter.draw_all(SCENES[name][1](SceneBuilder(bank, rng, focal_px)))
     low, high = np.percentile(painter.canvas[::3, ::3], (1.0, 99.0))
-    wide = min(log_uniform(rng, 80.0, 700.0), 250.0)
+    wide = min(log_uniform(rng, 110.0, 700.0), 250.0)
     bottom = rng.uniform(0.0, 255.0 - wide)
     return to_grey(bottom + np.float32(wide / max(float(high - low), 12.0)) * (painter.canvas - np.float32(low)))

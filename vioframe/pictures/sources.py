@@ -57,6 +57,12 @@ _TEXTURES_OF_A_KIND = 12
 _FRESH = 0.22
 _SLANTS = HomographyOptions(patch_ratio=0.9, perspective=0.25, scale=0.3, max_angle=float(np.pi), overflow=0.0)
 _PERIOD = 60
+# A picture is painted anew where fewer of its blocks have any contrast.
+_BLOCK_PX = 16
+_LEAST_DEVIATION_DN = 5.0
+_LEAST_SHARE = 0.3
+TRIES = 4
+"""How often a picture is made until it shows something."""
 
 
 class PictureSource(Protocol):
@@ -110,12 +116,24 @@ class Textures:
 
     def picture(self, index: int) -> Image:
         """Picture ``index`` (H, W) uint8."""
-        rng = np.random.default_rng([self._seed, self._tag, index])
-        if rng.random() < _FRESH:
-            image = _fresh_surface(rng, self._size_px)
-        else:
-            image = paint_scene(str(rng.choice(self._scenes, p=self._shares)), self._size_px, self._bank, rng)
+        for attempt in range(TRIES):
+            rng = np.random.default_rng([self._seed, self._tag, index, attempt])
+            if rng.random() < _FRESH:
+                image = _fresh_surface(rng, self._size_px)
+            else:
+                image = paint_scene(str(rng.choice(self._scenes, p=self._shares)), self._size_px, self._bank, rng)
+            if shows_something(image):
+                break
         return change_light(image, rng, COMMON_LIGHT)
+
+
+def shows_something(image: Image) -> bool:
+    """Whether enough of a picture (H, W) uint8 differs from a blank wall to learn from or to measure on."""
+    size = max(image.shape[1] // _BLOCK_PX, 1), max(image.shape[0] // _BLOCK_PX, 1)
+    values = image.astype(np.float32)
+    mean = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
+    square = cv2.resize(values * values, size, interpolation=cv2.INTER_AREA)
+    return bool(np.mean(square - mean * mean > _LEAST_DEVIATION_DN**2) >= _LEAST_SHARE)
 
 
 def _fresh_surface(rng: np.random.Generator, size_px: tuple[int, int]) -> Image:

@@ -11,7 +11,7 @@ import pytest
 from vioframe.errors import ConfigError, DataError
 from vioframe.pictures import Mixture, PictureFolder, RenderedPlaces, Textures
 from vioframe.pictures.patches import PAINTERS, Patch, PatchPainter, TextureBank
-from vioframe.pictures.sources import fit_picture
+from vioframe.pictures.sources import fit_picture, shows_something
 
 SIZE = (96, 64)
 
@@ -73,8 +73,19 @@ def test_textures_are_varied_and_few_are_empty():
     pictures = [source.picture(index).astype(float) for index in range(40)]
     means, deviations = [p.mean() for p in pictures], np.array([p.std() for p in pictures])
     assert np.ptp(means) > 120.0
-    assert np.mean(deviations < 8.0) < 0.2
+    assert np.mean(deviations < 8.0) < 0.1
     assert np.median(deviations) > 25.0
+
+
+def test_a_blank_wall_shows_nothing_and_a_board_does():
+    assert not shows_something(np.full((64, 96), 90, np.uint8))
+    ramp = np.tile(np.linspace(50, 120, 96).astype(np.uint8), (64, 1))
+    assert not shows_something(ramp)
+    board = np.kron(np.indices((8, 12)).sum(axis=0) % 2, np.ones((8, 8))).astype(np.uint8)
+    assert shows_something(100 * board)
+    half = 100 * board
+    half[:, 16:] = 40
+    assert not shows_something(half)
 
 
 def test_textures_come_fast_enough():
