@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -28,7 +29,33 @@ def bearing(node: object, without: Sequence[str] = ()) -> object:
         return node
     kept = {str(name): bearing(value, without) for name, value in node.items() if name not in (*_WITHOUT, *without)}
     source = kept.get("weights")
-    if isinstance(source, str) and Path(source).expanduser().is_file():
-        with Path(source).expanduser().open("rb") as file:
-            kept["weights"] = hashlib.file_digest(file, "sha256").hexdigest()
+    if isinstance(source, str):
+        file = Path(source).expanduser()
+        kept["weights"] = _hash(file) if file.is_file() else (_shipped(kept) or source)
     return kept
+
+
+def _shipped(options: dict[str, object]) -> list[str]:
+    """Content of what a package keeps in its folder ``weights``; of several files, of those that the options name."""
+    package = str(options.get("_target_", "")).partition(".")[0]
+    # The specification of a package on top is found without importing it.
+    spec = find_spec(package) if package else None
+    if spec is None or not spec.submodule_search_locations:
+        return []
+    folder = Path(next(iter(spec.submodule_search_locations))) / "weights"
+    files = sorted(file for file in folder.glob("*.safetensors") if file.is_file())
+    named = [file for file in files if file.stem in _texts(options)]
+    return [_hash(file) for file in named or files]
+
+
+def _texts(node: object) -> set[str]:
+    if isinstance(node, dict):
+        return set().union(*map(_texts, node.values()))
+    if isinstance(node, list):
+        return set().union(*map(_texts, node))
+    return {node} if isinstance(node, str) else set()
+
+
+def _hash(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -30,6 +30,24 @@ def test_key_follows_the_content_of_weights_not_their_name(tmp_path):
     assert keys[0] == keys[1] != keys[2]
 
 
+def test_key_follows_the_content_of_weights_that_came_with_a_package(tmp_path, monkeypatch):
+    """Trained anew they are another net, under the same name."""
+    (tmp_path / "acme_net" / "weights").mkdir(parents=True)
+    (tmp_path / "acme_net" / "__init__.py").write_text("raise RuntimeError('no key needs an import')")
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def key(name="small"):
+        options = {"_target_": "acme_net.Part", "weights": "shipped", "encoder": {"name": name}}
+        return cell_key(OmegaConf.create({"frontend": options}))
+
+    keys = [key()]
+    for name, content in (("small", b"1"), ("small", b"2"), ("large", b"3")):
+        (tmp_path / "acme_net" / "weights" / f"{name}.safetensors").write_bytes(content)
+        keys.append(key())
+    # The last file is that of another encoder.
+    assert len(set(keys[:3])) == 3 and keys[3] == keys[2] != key("large")
+
+
 def test_option_that_leads_nowhere_is_named():
     with pytest.raises(ConfigError, match="fuser: "):
         cell_key(OmegaConf.create({"fuser": {"seed": "${nowhere}"}}))
