@@ -63,6 +63,7 @@ COLUMNS = (
     Column(title="\n3 px", value=_at(3), decimals=3, sign=1),
     Column(title="\n5 px", value=_at(5), decimals=3, sign=1),
     Column(title="time\nms", value=lambda s: s.milliseconds, decimals=1, sign=-1),
+    Column(title="CPU\nms", value=lambda s: s.cpu_milliseconds, decimals=1, sign=-1),
 )
 
 
@@ -120,7 +121,12 @@ def print_summaries(
     if all(len(of_method) <= FEW_PAIRS for of_method in scores.values()):
         console.print(_pair_table(scores))
     console.print(protocol.sentence(), style="dim", markup=False, highlight=False)
-    console.print(f"time: median of extraction, a picture; {threads}", style="dim", markup=False, highlight=False)
+    console.print(
+        f"time: median of extraction, a picture, on the clock and of the processor; {threads}",
+        style="dim",
+        markup=False,
+        highlight=False,
+    )
 
 
 def pair_cell(score: PairScores) -> str:

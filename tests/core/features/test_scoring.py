@@ -114,6 +114,14 @@ def test_means_by_split_and_over_all(make_protocol):
     assert good.accuracy_at(1) == 1.0
 
 
+def test_pictures_without_anything_in_common_are_left_out(make_protocol, caplog):
+    away = np.array([[1.0, 0.0, 316.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    pairs = [pair_of(away, "apart"), pair_of(TRUE, "together")]
+    seen = list(evaluate_pairs({"oracle": Oracle(TRUE)}, pairs, make_protocol()))
+    assert [pair.name for pair, _ in seen] == ["together"]
+    assert "apart is left out" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

@@ -53,7 +53,7 @@ def test_known_sequences_from_the_command_line(cli, tmp_path):
     assert len(rows) == 3 * len(METHODS)
     for method in METHODS:
         same, turned = rows[method, "illumination"], rows[method, "viewpoint"]
-        assert same["points"] == 100 and same["milliseconds"] > 0
+        assert same["points"] == 100 and min(same["milliseconds"], same["cpu_milliseconds"]) > 0
         assert (same["repeatability"], same["localisation_px"]) == (1.0, pytest.approx(0.0, abs=1e-9))
         assert 0.4 < turned["repeatability"] < 1.0 and 0.0 < turned["localisation_px"] < 2.0
         described = method in ("orb", "sift")
