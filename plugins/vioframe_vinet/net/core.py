@@ -18,6 +18,8 @@ from vioframe_vinet.net.lasting import Lasting, LastingScale
 _MOTION = 6
 # In squared units of the output: one sample known to 2.5 thousandths of a unit must not outweigh all others.
 _LARGEST_LOG_VARIANCE = 12.0
+# ln of a variance that an output of 1 is worth.
+_SPREAD_GAIN = 4.0
 # What a feature of 1 means: m of the pose that is fed back.
 _PLACE_UNIT = 10.0
 
@@ -164,7 +166,10 @@ class VinetCore(nn.Module):
         nn.init.zeros_(self.answer.bias)
         if self.spread is not None:
             nn.init.normal_(self.spread.weight, std=0.1 * joined**-0.5)
-            nn.init.zeros_(self.spread.bias)
+            # A gyro turns by far less wrongly than an output of 1, and steps are told to about a quarter of it.
+            with torch.no_grad():
+                self.spread.bias[:3] = (-6.0 if gyro_turns else 0.0) / _SPREAD_GAIN
+                self.spread.bias[3:] = -3.0 / _SPREAD_GAIN
 
     def begin(self, sequences: int) -> CoreState:
         """The state of sequences that begin."""
@@ -242,7 +247,8 @@ class VinetCore(nn.Module):
         # What is learned of errors must not bend what is learned of motions: the larger gradient is that of variances.
         variances = None
         if self.spread is not None:
-            limited = self.spread(known).float().clamp(-_LARGEST_LOG_VARIANCE, _LARGEST_LOG_VARIANCE)
+            limited = _SPREAD_GAIN * self.spread(known).float()
+            limited = limited.clamp(-_LARGEST_LOG_VARIANCE, _LARGEST_LOG_VARIANCE)
             variances = limited + 2.0 * limited.new_tensor([self._units[0]] * 3 + [self._units[1]] * 3).log()
         vector = torch.cat([log_so3(R), p], dim=-1)
         return CoreAnswer(from_parts(R, p), vector, variances, lasting, rotations.sight), state
