@@ -17,7 +17,7 @@ from vioframe.vision.gray import gray_image, normalise_exposure
 from vioframe.vision.outliers import epipolar_inliers
 from vioframe.vision.spread import crowded
 from vioframe.vision.two_cameras import TwoCameras
-from vioframe_klt.anchors import Anchors
+from vioframe.vision.anchors import Anchors
 from vioframe_klt.points import Points, inside
 from vioframe_klt.search import Search
 from vioframe_klt.stereo import StereoMatcher

@@ -10,6 +10,7 @@ from vioframe.learning import require_torch
 from vioframe.types import Frame, SensorRig, VisualFeatures
 from vioframe.vision.descriptor_frontend import DescriptorFrontend
 from vioframe.vision.keeper import KeeperOptions
+from vioframe.vision.placing import AnchorOptions
 from vioframe_superpoint.extractor import SHIPPED, SuperPointExtractor
 from vioframe_superpoint.options import Encoder, Refinement
 from vioframe_superpoint.training import TrainingOptions
@@ -40,6 +41,10 @@ class SuperPointFrontend(DescriptorFrontend):
         suppression_px: no other point in the square of this half side around one.
         refinement: of a point's place: ``heat``, ``gradient`` or ``none``.
         refinement_px: half side of the window in which this is done.
+        anchor_window_px: odd side of the patch by which a matched point is placed; 0 leaves it where it was found.
+        anchor_steps: to align the patch, an image.
+        anchor_reach_px: largest distance of the aligned point from where it was found.
+        min_correlation: of the patch that a point began with and what is seen now.
         search_px: how far from where the gyro's rotation puts it a point is looked for.
         blind_search_px: the same where there is no gyro.
         memory_images: for how many images an absent point is remembered.
@@ -74,6 +79,10 @@ class SuperPointFrontend(DescriptorFrontend):
         suppression_px: int = 4,
         refinement: Refinement = "heat",
         refinement_px: int = 2,
+        anchor_window_px: int = 19,
+        anchor_steps: int = 3,
+        anchor_reach_px: float = 2.0,
+        min_correlation: float = 0.8,
         search_px: float = 15.0,
         blind_search_px: float = 80.0,
         memory_images: int = 5,
@@ -89,6 +98,11 @@ class SuperPointFrontend(DescriptorFrontend):
         _require("max_points", max_points, max_points >= 1, "at least 1")
         _require("min_distance_px", min_distance_px, min_distance_px >= 2.0, "at least 2")
         _require("keypoints", keypoints, keypoints >= max_points, f"at least max_points={max_points}")
+        odd = anchor_window_px == 0 or (anchor_window_px >= 7 and anchor_window_px % 2 == 1)
+        _require("anchor_window_px", anchor_window_px, odd, "odd and at least 7, or 0")
+        _require("anchor_steps", anchor_steps, anchor_steps >= 1, "at least 1")
+        _require("anchor_reach_px", anchor_reach_px, anchor_reach_px > 0.0, "positive")
+        _require("min_correlation", min_correlation, 0.0 <= min_correlation < 1.0, "at least 0 and below 1")
         _require("search_px", search_px, search_px > 0.0, "positive")
         _require("blind_search_px", blind_search_px, blind_search_px > 0.0, "positive")
         _require("memory_images", memory_images, memory_images >= 1, "at least 1")
@@ -130,6 +144,15 @@ class SuperPointFrontend(DescriptorFrontend):
             min_depth=min_depth,
             normalise=normalise_exposure,
             border_px=border_px,
+            anchors=AnchorOptions(
+                window_px=anchor_window_px,
+                steps=anchor_steps,
+                reach_px=anchor_reach_px,
+                min_correlation=min_correlation,
+                memory_images=memory_images,
+            )
+            if anchor_window_px
+            else None,
         )
 
     @property
@@ -150,7 +173,9 @@ class SuperPointFrontend(DescriptorFrontend):
     def train_itself(self, folder: Path, tracker: "Tracker", *, shown: bool, resume: bool) -> Mapping[str, Path]:
         """See :class:`vioframe.interfaces.TrainsItself`. It begins with a random net, whatever ``weights`` says."""
         if self._training is None:
-            raise ConfigError("frontend.training is null, so there is nothing that says how to train frontend=superpoint")
+            raise ConfigError(
+                "frontend.training is null, so there is nothing that says how to train frontend=superpoint"
+            )
         require_torch("task=train frontend=superpoint", training=True)
         from vioframe_superpoint.training.stages import Training
 
@@ -190,7 +215,10 @@ class SuperPointFrontend(DescriptorFrontend):
                 self._superpoint.extract_many([each[camera] for each in grays], mask)
                 for camera, mask in enumerate(self.masks)
             ]
-            found += [self.follow(frame, points, None) for frame, *points in zip(part, *seen, strict=True)]
+            found += [
+                self.follow(frame, gray[0], points, None)
+                for frame, gray, *points in zip(part, grays, *seen, strict=True)
+            ]
         return found
 
 

@@ -14,6 +14,7 @@ from vioframe.vision.gray import gray_image, normalise_exposure
 from vioframe.vision.keeper import KeeperOptions, TrackKeeper
 from vioframe.vision.keypoints import Extractor, Keypoints
 from vioframe.vision.matching import match
+from vioframe.vision.placing import AnchoredPlaces, AnchorOptions
 from vioframe.vision.two_cameras import TwoCameras
 
 
@@ -31,6 +32,7 @@ class DescriptorFrontend(Frontend):
         min_depth: nearer points are not matched there, m.
         normalise: bring every image to one mean and contrast.
         border_px: no points nearer to the edge of the image.
+        anchors: place matched points by their patches; None leaves them where the extractor found them.
     """
 
     def __init__(
@@ -43,6 +45,7 @@ class DescriptorFrontend(Frontend):
         min_depth: float,
         normalise: bool,
         border_px: int,
+        anchors: AnchorOptions | None = None,
     ) -> None:
         # What it needs and gives depends on its options, so the instance says it, not the class.
         self.requires = frozenset({IMAGES, STEREO} if stereo else {IMAGES})  # type: ignore[misc]
@@ -54,6 +57,7 @@ class DescriptorFrontend(Frontend):
         self._min_depth = min_depth
         self._normalise = normalise
         self._border = border_px
+        self._anchors = anchors
         self._camera: Camera | None = None
 
     def setup(self, rig: SensorRig) -> None:
@@ -77,6 +81,7 @@ class DescriptorFrontend(Frontend):
             if self._stereo
             else None
         )
+        self._places = None if self._anchors is None else AnchoredPlaces(self._anchors)
         self._points = 0
         self._lost_all = 0
 
@@ -93,10 +98,9 @@ class DescriptorFrontend(Frontend):
             StateError: called before ``setup``.
             DataError: the frame lacks an image, or has one that does not fit the calibration.
         """
-        keypoints = [
-            self._extractor.extract(gray, mask) for gray, mask in zip(self.gray_images(frame), self.masks, strict=True)
-        ]
-        return self.follow(frame, keypoints, R_prev_cur)
+        grays = self.gray_images(frame)
+        keypoints = [self._extractor.extract(gray, mask) for gray, mask in zip(grays, self.masks, strict=True)]
+        return self.follow(frame, grays[0], keypoints, R_prev_cur)
 
     @property
     def masks(self) -> list[np.ndarray]:
@@ -114,8 +118,17 @@ class DescriptorFrontend(Frontend):
         grays = [gray_image(frame, index, camera, self._name) for index, camera in enumerate(self._cameras)]
         return [normalise_exposure(gray) for gray in grays] if self._normalise else grays
 
-    def follow(self, frame: Frame, keypoints: Sequence[Keypoints], R_prev_cur: Array | None) -> VisualFeatures:
-        """What :meth:`process` returns, of keypoints that were found in the image of each camera."""
+    def follow(
+        self, frame: Frame, gray: Image, keypoints: Sequence[Keypoints], R_prev_cur: Array | None
+    ) -> VisualFeatures:
+        """What :meth:`process` returns.
+
+        Args:
+            frame: the next.
+            gray: its image of camera 0, as :meth:`gray_images` has it.
+            keypoints: that were found in the image of each camera.
+            R_prev_cur: as of :meth:`process`.
+        """
         camera = self._calibrated()
         bearings = projection.bearings(camera, keypoints[0].pixels)
         R_cam = None
@@ -123,13 +136,19 @@ class DescriptorFrontend(Frontend):
             R_body_cam = camera.T_body_cam[:3, :3]
             R_cam = R_body_cam.T @ R_prev_cur @ R_body_cam
         ids, index, ages = self._keeper.keep(keypoints[0], bearings, R_cam)
+        pixels, bearings = keypoints[0].pixels[index], bearings[index]
+        if self._places is not None:
+            pixels, slipped = self._places.place(gray, ids, pixels)
+            self._keeper.forget(ids[slipped])
+            ids, index, ages, pixels = ids[~slipped], index[~slipped], ages[~slipped], pixels[~slipped]
+            bearings = projection.bearings(camera, pixels)
         self._lost_all += self._points > 0 and not (ages > 1).any()
         self._points = len(ids)
         points = keypoints[0].select(index)
         tracks = Tracks(
             ids=ids,
-            pixels=points.pixels,
-            bearings=bearings[index],
+            pixels=pixels,
+            bearings=bearings,
             scores=ages.astype(float),
             descriptors=points.descriptors,
         )

@@ -108,6 +108,13 @@ class TrackKeeper:
         self._past.appendleft(_Seen(ids=self._ids[here], bearings=self._bearings[here], R_then_now=np.eye(3)))
         return self._ids[here], index, self._ages[here]
 
+    def forget(self, ids: Stamps) -> None:
+        """Do not look for these points again."""
+        keep = ~np.isin(self._ids, ids)
+        self._ids, self._ages, self._absent = self._ids[keep], self._ages[keep], self._absent[keep]
+        self._bearings, self._drift = self._bearings[keep], self._drift[keep]
+        self._descriptors = self._descriptors[keep]
+
     def _find(self, keypoints: Keypoints, gyro: bool) -> tuple[np.ndarray, np.ndarray]:
         """Rows of the memory, ascending, and the keypoints that match them."""
         if len(self._ids) == 0 or len(keypoints) == 0:

@@ -1,0 +1,96 @@
+"""Matched points placed by how their surroundings first looked, instead of where a detector found them this time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vioframe.checks import Array, Mask, Stamps
+from vioframe.types import Image
+from vioframe.vision.anchors import Anchors
+
+# A patch seen so much larger, or smaller, than it first was is cut anew.
+_MAX_STRETCH = 1.6
+# Share of patches below which what does not fit is not the points' fault.
+_FEW_FIT = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnchorOptions:
+    """How a matched point is placed by its patch.
+
+    Attributes:
+        window_px: odd side of the patch.
+        steps: to align it, an image.
+        reach_px: largest distance of the aligned point from where the detector found it.
+        min_correlation: of the patch as it first looked and what is seen now.
+        memory_images: for how many images a patch is kept whose point is not seen.
+    """
+
+    window_px: int
+    steps: int
+    reach_px: float
+    min_correlation: float
+    memory_images: int
+
+
+class AnchoredPlaces:
+    """Where points with lasting ids are.
+
+    A detector finds a corner again to a fraction of a pixel that differs from image to image. The patch around it,
+    aligned under an affine warp with any gain and offset of its light, says to a tenth where the same point is. A
+    match whose patch does not fit is a slip to a neighbour, unless few fit: then the image is to blame (light that no
+    gain undoes, blur), and points are taken where they were found.
+
+    Args:
+        options: see there.
+    """
+
+    def __init__(self, options: AnchorOptions) -> None:
+        self._options = options
+        self._anchors = Anchors(options.window_px)
+        self._ids: Stamps = np.zeros(0, dtype=np.int64)
+        self._absent: np.ndarray = np.zeros(0, dtype=np.int64)
+
+    def place(self, gray: Image, ids: Stamps, pixels: Array) -> tuple[Array, Mask]:
+        """Places (M, 2) px of points that were found at ``pixels``, and which of them (M,) are other points now.
+
+        Args:
+            gray: (H, W) uint8, the next image.
+            ids: (M,) of its points, ascending; higher than all before where they are new.
+            pixels: (M, 2) px where they were found.
+        """
+        _, rows, seen = np.intersect1d(self._ids, ids, assume_unique=True, return_indices=True)
+        placed, slipped = pixels.copy(), np.zeros(len(ids), dtype=bool)
+        keep = self._absent < self._options.memory_images
+        keep[rows] = True
+        if len(rows):
+            found, fits, worn = self._align(gray, pixels[seen], rows)
+            if fits.mean() >= _FEW_FIT:
+                placed[seen] = found
+                slipped[seen[~fits]] = True
+                keep[rows[~fits]] = False
+            else:
+                worn[:] = True
+            # What has come to look otherwise begins anew at its place.
+            if worn.any():
+                self._anchors.renew(gray, placed[seen[worn]], rows[worn])
+        self._absent += 1
+        self._absent[rows] = 0
+        fresh = np.setdiff1d(np.arange(len(ids)), seen)
+        self._anchors.select(keep)
+        self._anchors.add(gray, placed[fresh])
+        self._ids = np.concatenate([self._ids[keep], ids[fresh]])
+        self._absent = np.concatenate([self._absent[keep], np.zeros(len(fresh), dtype=np.int64)])
+        return placed, slipped
+
+    def _align(self, gray: Image, pixels: Array, rows: np.ndarray) -> tuple[Array, Mask, Mask]:
+        """Places (K, 2), which patches fit there (K,), and which of these are seen much larger or smaller (K,)."""
+        options = self._options
+        found, bend, correlation = self._anchors.align(gray, pixels, self._anchors.bend[rows], options.steps, rows)
+        with np.errstate(invalid="ignore"):
+            near = np.linalg.norm(found - pixels, axis=-1) < options.reach_px
+            fits: Mask = np.asarray(near & (correlation > options.min_correlation))
+        self._anchors.bend[rows[fits]] = bend[fits]
+        stretch = np.linalg.svd(np.where(fits[:, None, None], bend, np.eye(2)), compute_uv=False)
+        worn = (stretch[:, 0] > _MAX_STRETCH) | (stretch[:, 1] < 1.0 / _MAX_STRETCH)
+        return np.where(fits[:, None], found, pixels), fits, worn
