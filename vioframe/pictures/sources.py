@@ -42,14 +42,15 @@ COMMON_LIGHT = LightingOptions(
     gamma=0.3,
     low_light=0.0,
     noise=0.4,
-    noise_dn=3.0,
+    noise_dn=2.0,
     speckle=0.0,
     blur=0.3,
     blur_sigma_px=0.9,
     motion_blur=0.0,
-    compression=0.1,
+    compression=0.0,
 )
-"""What is done to every made picture: the light and the camera of a usual photograph."""
+"""What is done to every made picture: the light and the camera of a usual photograph. No traces of compression: in two
+views of one picture they would be a part of the scene."""
 
 # Tags that keep the random numbers of one purpose apart from those of all others.
 _TEXTURES, _HELD_OUT_TEXTURES, _MIXTURE = 72, 73, 75

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from vioframe.checks import Array
+from vioframe.data.simulator.texture import fractal_noise, to_grey
 from vioframe.pictures import LightingOptions, change_light
 from vioframe.types import Image
 
@@ -139,13 +140,15 @@ class Canvas:
         """
         earlier = np.concatenate(self._corners) if self._corners else np.zeros((0, 2))
         self._corners = [earlier[~_inside(earlier, polygon, 0.75)]]
-        for number, other in enumerate(self._layers):
-            crossings = crossing_points(polygon, other)
-            for later in self._layers[number + 1 :]:
-                if not len(crossings):
-                    break
-                crossings = crossings[~_inside(crossings, later, 0.75)]
-            self._corners.append(crossings)
+        if self._layers:
+            edges = np.concatenate([np.stack([other, following(other)], axis=1) for other in self._layers])
+            layer = np.repeat(np.arange(len(self._layers)), [len(other) for other in self._layers])
+            crossings, hit = _cross(np.stack([polygon, following(polygon)], axis=1), edges)
+            seen = np.ones(len(crossings), dtype=bool)
+            for number, later in enumerate(self._layers):
+                behind = np.flatnonzero(seen & (layer[hit] < number))
+                seen[behind] = ~_inside(crossings[behind], later, 0.75)
+            self._corners.append(crossings[seen])
         self._layers.append(polygon)
 
     def outline(self, points: Array) -> None:
@@ -172,19 +175,28 @@ def pick_grey(rng: np.random.Generator, others: Sequence[float], contrast: float
     return int(rng.choice(fitting))
 
 
+def following(points: Array) -> Array:
+    """The next point (N, 2) of each on a closed line."""
+    return np.concatenate([points[1:], points[:1]])
+
+
 def crossing_points(first: Array, second: Array) -> Array:
     """Points (N, 2) px where the outlines of two closed polygons (·, 2) cross."""
-    a, b = first, np.roll(first, -1, axis=0) - first
-    c, d = second, np.roll(second, -1, axis=0) - second
+    return _cross(np.stack([first, following(first)], axis=1), np.stack([second, following(second)], axis=1))[0]
+
+
+def _cross(first: Array, second: Array) -> tuple[Array, np.ndarray]:
+    """Crossings (K, 2) px of segments (N, 2, 2) with segments (M, 2, 2), and which of the latter each lies on."""
+    a, b = first[:, 0], first[:, 1] - first[:, 0]
+    c, d = second[:, 0], second[:, 1] - second[:, 0]
     determinant = b[:, None, 0] * d[None, :, 1] - b[:, None, 1] * d[None, :, 0]
     off = c[None] - a[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         s = (off[..., 0] * d[None, :, 1] - off[..., 1] * d[None, :, 0]) / determinant
         t = (off[..., 0] * b[:, None, 1] - off[..., 1] * b[:, None, 0]) / determinant
-    hit = (s > 0.0) & (s < 1.0) & (t > 0.0) & (t < 1.0)
-    row = np.nonzero(hit)[0]
-    points: Array = a[row] + s[hit][:, None] * b[row]
-    return points
+    row, column = np.nonzero((s > 0.0) & (s < 1.0) & (t > 0.0) & (t < 1.0))
+    points: Array = a[row] + s[row, column][:, None] * b[row]
+    return points, column
 
 
 def _inside(points: Array, polygon: Array, margin_px: float) -> np.ndarray:
@@ -196,11 +208,12 @@ def _inside(points: Array, polygon: Array, margin_px: float) -> np.ndarray:
 
 def _shrink(points: Array, by_px: float) -> Array:
     """A polygon (N, 2) with every side moved inwards; corners sharper than 30° move no further than at 30°."""
-    along = np.roll(points, -1, axis=0) - points
-    area = float(np.sum(points[:, 0] * np.roll(points[:, 1], -1) - points[:, 1] * np.roll(points[:, 0], -1)))
+    after = following(points)
+    along = after - points
+    area = float(points[:, 0] @ after[:, 1] - points[:, 1] @ after[:, 0])
     along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
     inward = np.sign(area) * np.stack([-along[:, 1], along[:, 0]], axis=-1)
-    both = inward + np.roll(inward, 1, axis=0)
+    both = inward + np.concatenate([inward[-1:], inward[:-1]])
     # |n1 + n2|² = 2 (1 + cos) and the corner moves by (n1 + n2) / (1 + cos).
     moved: Array = points + by_px * both / np.maximum(0.5 * np.sum(both**2, axis=1, keepdims=True), 0.13)
     return moved
@@ -217,32 +230,20 @@ def _stand_out(image: Image, corners: Array, contrast: float) -> np.ndarray:
 
 
 def _merge(corners: Array) -> Array:
-    """Corners of which no two are closer than ``_SAME_CORNER_PX``: each group becomes its mean."""
-    while True:
-        merged: list[Array] = []
-        left = corners
-        while len(left):
-            near = np.linalg.norm(left - left[0], axis=1) < _SAME_CORNER_PX
-            merged.append(left[near].mean(axis=0))
-            left = left[~near]
-        if len(merged) == len(corners):
-            return corners
-        # Means may lie closer to others than what they are the means of.
-        corners = np.array(merged)
-
-
-def _grain(rng: np.random.Generator, shape: tuple[int, int], coarse_px: float, octaves: int) -> np.ndarray:
-    """Smooth noise (H, W) float32 of about unit deviation."""
-    height, width = shape
-    total = np.zeros(shape, np.float32)
-    weight, power, cell = 1.0, 0.0, coarse_px
-    for _ in range(octaves):
-        rows, columns = max(round(height / cell), 2), max(round(width / cell), 2)
-        small = rng.standard_normal((rows, columns), dtype=np.float32)
-        total += weight * cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
-        power += 0.5 * weight**2
-        weight, cell = 0.6 * weight, max(0.45 * cell, 1.0)
-    return total / np.float32(np.sqrt(power))
+    """Corners of which no two are closer than ``_SAME_CORNER_PX``: each group becomes one between them."""
+    while len(corners) > 1:
+        near = np.abs(corners[:, None] - corners[None]).max(axis=-1) < _SAME_CORNER_PX
+        row, column = np.nonzero(np.triu(near, 1))
+        apart = np.linalg.norm(corners[row] - corners[column], axis=1)
+        if not len(apart) or apart.min() >= _SAME_CORNER_PX:
+            break
+        # Means may lie closer to others than what they are the means of, so only one pair at a time.
+        closest = int(np.argmin(apart))
+        middle = 0.5 * (corners[row[closest]] + corners[column[closest]])
+        kept = np.ones(len(corners), dtype=bool)
+        kept[[row[closest], column[closest]]] = False
+        corners = np.concatenate([corners[kept], middle[None]])
+    return corners
 
 
 def _ramp(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
@@ -254,19 +255,15 @@ def _ramp(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
     return plane.astype(np.float32)
 
 
-def _to_gray(field: np.ndarray) -> Image:
-    return np.clip(field + 0.5, 0.0, 255.0).astype(np.uint8)
-
-
 def _paint_ground(rng: np.random.Generator, shape: tuple[int, int], contrast: float) -> Image:
     """What is behind all shapes: a level, a ramp, soft blots, smooth noise; nothing on it is a corner."""
     field = np.full(shape, rng.uniform(20.0, 235.0), np.float32)
     field += rng.uniform(0.0, 45.0) * _ramp(rng, shape)
     kind = rng.integers(4)
     if kind == 1:
-        field += rng.uniform(0.0, 30.0) * _grain(rng, shape, 0.5 * min(shape), 2)
+        field += rng.uniform(0.0, 30.0) * fractal_noise(rng, shape, 0.5 * min(shape), 2)
     elif kind == 2:
-        field += min(0.22 * contrast, 14.0) * rng.random() * _grain(rng, shape, rng.uniform(3.0, 30.0), 3)
+        field += min(0.22 * contrast, 14.0) * rng.random() * fractal_noise(rng, shape, rng.uniform(3.0, 30.0), 3, 0.6)
     elif kind == 3:
         blots = np.full((max(shape[0] // 4, 4), max(shape[1] // 4, 4)), 0.0, np.float32)
         for _ in range(int(rng.integers(4, 20))):
@@ -274,7 +271,7 @@ def _paint_ground(rng: np.random.Generator, shape: tuple[int, int], contrast: fl
             cv2.circle(blots, centre, int(rng.integers(2, 12)), rng.uniform(-50.0, 50.0), -1)
         blots = cv2.GaussianBlur(blots, (0, 0), rng.uniform(2.0, 5.0))
         field += cv2.resize(blots, shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return _to_gray(field)
+    return to_grey(field)
 
 
 def _paint_face(rng: np.random.Generator, shape: tuple[int, ...], grey: float, range_dn: float) -> Image:
@@ -282,6 +279,6 @@ def _paint_face(rng: np.random.Generator, shape: tuple[int, ...], grey: float, r
     small = max(shape[0] // _FINE, 2), max(shape[1] // _FINE, 2)
     field = grey + 0.6 * range_dn * rng.uniform(0.0, 1.0) * _ramp(rng, small)
     if rng.random() < 0.6:
-        field += 0.3 * range_dn * rng.random() * _grain(rng, small, rng.uniform(2.0, 16.0), 2)
-    face: Image = cv2.resize(_to_gray(field), (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
+        field += 0.3 * range_dn * rng.random() * fractal_noise(rng, small, rng.uniform(2.0, 16.0), 2, 0.6)
+    face: Image = cv2.resize(to_grey(field), (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
     return face

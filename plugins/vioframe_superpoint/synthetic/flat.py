@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from vioframe.checks import Array
-from vioframe_superpoint.synthetic.canvas import Canvas, crossing_points, pick_grey
+from vioframe_superpoint.synthetic.canvas import Canvas, crossing_points, following, pick_grey
 
 # A stroke up to this width has one corner at its end; a wider one two.
 _THIN_PX = 3.0
@@ -67,7 +67,8 @@ def random_polygon(canvas: Canvas, centre: Array, reach_px: float) -> Array | No
     # Mostly convex; some with deep notches.
     radius = reach_px * rng.uniform(0.35 if rng.random() < 0.3 else 0.75, 1.0, count)
     points: Array = centre + radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    back, forth = np.roll(points, 1, axis=0) - points, np.roll(points, -1, axis=0) - points
+    forth = following(points) - points
+    back = np.concatenate([-forth[-1:], -forth[:-1]])
     lengths = np.linalg.norm(back, axis=1), np.linalg.norm(forth, axis=1)
     cosine = np.sum(back * forth, axis=1) / (lengths[0] * lengths[1])
     if min(lengths[0].min(), reach_px) < 6.0 or cosine.min() < _FLATTEST_COSINE or cosine.max() > _SHARPEST_COSINE:
