@@ -163,8 +163,8 @@ class Canvas:
         corners = corners[np.all((corners >= 0.0) & (corners <= (width - 1, height - 1)), axis=1)]
         corners = _merge(corners[_stand_out(clean, corners, _LEAST_CONTRAST)])
         lit = change_light(clean, self.rng, _LIGHT)
-        # What is burnt out or black is gone; noise is no reason to overlook a corner.
-        return lit, corners[_stand_out(lit, corners, _LEAST_LEFT)]
+        # What is burnt out, black or far below the noise is gone.
+        return lit, corners[_stand_out(cv2.GaussianBlur(lit, (0, 0), 1.0), corners, _LEAST_LEFT)]
 
 
 def pick_grey(rng: np.random.Generator, others: Sequence[float], contrast: float) -> int:
