@@ -1,7 +1,8 @@
 """Tracks of a front end against the exact motion of a drawn scene: drift, life, spread, stereo, time.
 
     OMP_NUM_THREADS=1 python benchmarks/tracks.py --replay /data/euroc_imu_gt [--frontend orb] [--stereo]
-        [--sequence V1_01_easy,V1_02_medium] [--start 20] [--seconds 8]
+        [--sequence V1_01_easy,V1_02_medium] [--start 20] [--seconds 8] [--set refinement=gradient ...]
+    ... --frontend superpoint [--encoder vgg] [--set weights=FILE]
 
 The recorded motion is drawn anew; the point that a track began with is known from the depth of that image, and every
 later observation is compared with where that point is seen. Tracks that begin at an edge of depth are left out.
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import yaml
 
 from vioframe.checks import Array
 from vioframe.data.simulator import ReplayDataset
@@ -26,8 +28,10 @@ from vioframe_klt import KltFrontend
 from vioframe_opencv import SiftFrontend
 from vioframe_orb import OrbFrontend
 from vioframe_recordings import EurocDataset
+from vioframe_superpoint import SuperPointFrontend
+from vioframe_superpoint.options import WIDTHS, encoder_named
 
-FRONTENDS = {"klt": KltFrontend, "orb": OrbFrontend, "sift": SiftFrontend}
+FRONTENDS = {"klt": KltFrontend, "orb": OrbFrontend, "sift": SiftFrontend, "superpoint": SuperPointFrontend}
 AGES = ((2, 6), (6, 16), (16, 41), (41, 10**6))
 EDGE_RATIO = 1.03
 GROSS_PX = 3.0
@@ -136,13 +140,18 @@ def main() -> None:
     parser.add_argument("--stereo", action="store_true")
     parser.add_argument("--start", type=float, default=20.0, help="s after the first image")
     parser.add_argument("--seconds", type=float, default=8.0)
+    parser.add_argument("--encoder", choices=WIDTHS, default="mobilenetv2", help="of superpoint")
+    parser.add_argument("--set", nargs="*", default=[], metavar="OPTION=VALUE", help="of the front end")
     options = parser.parse_args()
     cv2.setNumThreads(1)
+    chosen = {name: yaml.safe_load(value) for name, _, value in (each.partition("=") for each in options.set)}
+    if options.frontend == "superpoint":
+        chosen["encoder"] = encoder_named(options.encoder)
     cameras = 1 + options.stereo
     for sequence in options.sequence.split(","):
         source = EurocDataset(root=str(options.replay), sequence=sequence, cameras=cameras, images=False)
         data = ReplayDataset(source=source, cameras=cameras)
-        frontend = FRONTENDS[options.frontend](stereo=options.stereo)
+        frontend = FRONTENDS[options.frontend](stereo=options.stereo, **chosen)
         recording = data.open(data.sequences[0])
         tally = measure(recording, frontend, options.start, options.seconds, stereo=options.stereo)
         print(describe(sequence, tally), flush=True)

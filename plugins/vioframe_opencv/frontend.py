@@ -4,6 +4,7 @@ from vioframe.checks import check_positive
 from vioframe.errors import ConfigError
 from vioframe.vision.descriptor_frontend import DescriptorFrontend
 from vioframe.vision.keeper import KeeperOptions
+from vioframe.vision.placing import AnchorOptions
 from vioframe_opencv.sift import SiftExtractor
 
 
@@ -22,6 +23,10 @@ class SiftFrontend(DescriptorFrontend):
         layers: of an octave.
         sigma: blur of the first octave, px.
         upright: describe patches as they lie in the image, not turned to their strongest gradients.
+        anchor_window_px: odd side of the patch by which a matched point is placed; 0 leaves it where it was found.
+        anchor_steps: to align the patch, an image.
+        anchor_reach_px: largest distance of the aligned point from where it was found.
+        min_correlation: of the patch that a point began with and what is seen now.
         search_px: how far from where the gyro's rotation puts it a point is looked for.
         blind_search_px: the same where there is no gyro.
         memory_images: for how many images an absent point is remembered.
@@ -50,6 +55,10 @@ class SiftFrontend(DescriptorFrontend):
         layers: int = 3,
         sigma: float = 1.6,
         upright: bool = True,
+        anchor_window_px: int = 19,
+        anchor_steps: int = 3,
+        anchor_reach_px: float = 2.0,
+        min_correlation: float = 0.8,
         search_px: float = 15.0,
         blind_search_px: float = 80.0,
         memory_images: int = 5,
@@ -106,6 +115,13 @@ class SiftFrontend(DescriptorFrontend):
             min_depth=min_depth,
             normalise=normalise_exposure,
             border_px=border_px,
+            anchors=AnchorOptions(
+                window_px=anchor_window_px,
+                steps=anchor_steps,
+                reach_px=anchor_reach_px,
+                min_correlation=min_correlation,
+                memory_images=memory_images,
+            ),
         )
 
 

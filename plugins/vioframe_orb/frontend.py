@@ -3,6 +3,7 @@
 from vioframe.errors import ConfigError
 from vioframe.vision.descriptor_frontend import DescriptorFrontend
 from vioframe.vision.keeper import KeeperOptions
+from vioframe.vision.placing import AnchorOptions
 from vioframe_orb.extractor import OrbExtractor
 
 
@@ -20,6 +21,10 @@ class OrbFrontend(DescriptorFrontend):
         min_gradient: square root of that eigenvalue a corner needs at least, grey levels a pixel.
         subpixel_px: half side of the window in which a corner is placed, or 0.
         upright: describe patches as they lie in the image, not turned to their brightest side.
+        anchor_window_px: odd side of the patch by which a matched point is placed; 0 leaves it where it was found.
+        anchor_steps: to align the patch, an image.
+        anchor_reach_px: largest distance of the aligned point from where it was found.
+        min_correlation: of the patch that a point began with and what is seen now.
         search_px: how far from where the gyro's rotation puts it a point is looked for.
         blind_search_px: the same where there is no gyro.
         memory_images: for how many images an absent point is remembered.
@@ -47,6 +52,10 @@ class OrbFrontend(DescriptorFrontend):
         min_gradient: float = 1.0,
         subpixel_px: int = 4,
         upright: bool = True,
+        anchor_window_px: int = 19,
+        anchor_steps: int = 3,
+        anchor_reach_px: float = 2.0,
+        min_correlation: float = 0.8,
         search_px: float = 15.0,
         blind_search_px: float = 80.0,
         memory_images: int = 5,
@@ -97,6 +106,13 @@ class OrbFrontend(DescriptorFrontend):
             min_depth=min_depth,
             normalise=normalise_exposure,
             border_px=border_px,
+            anchors=AnchorOptions(
+                window_px=anchor_window_px,
+                steps=anchor_steps,
+                reach_px=anchor_reach_px,
+                min_correlation=min_correlation,
+                memory_images=memory_images,
+            ),
         )
 
 

@@ -98,11 +98,6 @@ class SuperPointFrontend(DescriptorFrontend):
         _require("max_points", max_points, max_points >= 1, "at least 1")
         _require("min_distance_px", min_distance_px, min_distance_px >= 2.0, "at least 2")
         _require("keypoints", keypoints, keypoints >= max_points, f"at least max_points={max_points}")
-        odd = anchor_window_px == 0 or (anchor_window_px >= 7 and anchor_window_px % 2 == 1)
-        _require("anchor_window_px", anchor_window_px, odd, "odd and at least 7, or 0")
-        _require("anchor_steps", anchor_steps, anchor_steps >= 1, "at least 1")
-        _require("anchor_reach_px", anchor_reach_px, anchor_reach_px > 0.0, "positive")
-        _require("min_correlation", min_correlation, 0.0 <= min_correlation < 1.0, "at least 0 and below 1")
         _require("search_px", search_px, search_px > 0.0, "positive")
         _require("blind_search_px", blind_search_px, blind_search_px > 0.0, "positive")
         _require("memory_images", memory_images, memory_images >= 1, "at least 1")
@@ -150,9 +145,7 @@ class SuperPointFrontend(DescriptorFrontend):
                 reach_px=anchor_reach_px,
                 min_correlation=min_correlation,
                 memory_images=memory_images,
-            )
-            if anchor_window_px
-            else None,
+            ),
         )
 
     @property

@@ -32,7 +32,7 @@ class DescriptorFrontend(Frontend):
         min_depth: nearer points are not matched there, m.
         normalise: bring every image to one mean and contrast.
         border_px: no points nearer to the edge of the image.
-        anchors: place matched points by their patches; None leaves them where the extractor found them.
+        anchors: place matched points by their patches.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class DescriptorFrontend(Frontend):
         min_depth: float,
         normalise: bool,
         border_px: int,
-        anchors: AnchorOptions | None = None,
+        anchors: AnchorOptions,
     ) -> None:
         # What it needs and gives depends on its options, so the instance says it, not the class.
         self.requires = frozenset({IMAGES, STEREO} if stereo else {IMAGES})  # type: ignore[misc]
@@ -81,7 +81,7 @@ class DescriptorFrontend(Frontend):
             if self._stereo
             else None
         )
-        self._places = None if self._anchors is None else AnchoredPlaces(self._anchors)
+        self._places = AnchoredPlaces(self._anchors) if self._anchors.window_px else None
         self._points = 0
         self._lost_all = 0
 

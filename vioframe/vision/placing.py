@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vioframe.checks import Array, Mask, Stamps
+from vioframe.errors import ConfigError
 from vioframe.types import Image
 from vioframe.vision.anchors import Anchors
 
@@ -19,11 +20,14 @@ class AnchorOptions:
     """How a matched point is placed by its patch.
 
     Attributes:
-        window_px: odd side of the patch.
+        window_px: odd side of the patch; 0 leaves points where they were found.
         steps: to align it, an image.
         reach_px: largest distance of the aligned point from where the detector found it.
         min_correlation: of the patch as it first looked and what is seen now.
         memory_images: for how many images a patch is kept whose point is not seen.
+
+    Raises:
+        ConfigError: with the key and its value.
     """
 
     window_px: int
@@ -31,6 +35,17 @@ class AnchorOptions:
     reach_px: float
     min_correlation: float
     memory_images: int
+
+    def __post_init__(self) -> None:
+        odd = self.window_px == 0 or (self.window_px >= 7 and self.window_px % 2 == 1)
+        for name, value, good, rule in (
+            ("anchor_window_px", self.window_px, odd, "odd and at least 7, or 0"),
+            ("anchor_steps", self.steps, self.steps >= 1, "at least 1"),
+            ("anchor_reach_px", self.reach_px, self.reach_px > 0.0, "positive"),
+            ("min_correlation", self.min_correlation, 0.0 <= self.min_correlation < 1.0, "at least 0 and below 1"),
+        ):
+            if not good:
+                raise ConfigError(f"frontend.{name} must be {rule}, got {value}")
 
 
 class AnchoredPlaces:
