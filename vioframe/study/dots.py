@@ -67,7 +67,7 @@ def _draw_metric(axes: "Axes", summary: StudySummary, column: Column) -> None:
                 ends = index + offset - 0.36 * step, index + offset + 0.36 * step
                 axes.plot(ends, [spread.median] * 2, color=colour, linewidth=2.6, solid_capstyle="butt")
     if drawn and min(drawn) > 0.0 and max(drawn) > _WIDE * min(drawn):
-        axes.set_yscale("log")
+        _use_logarithm(axes, (1.0, 2.0, 5.0))
     for x, colour in failures:
         axes.plot(x, 0.965, "x", color=colour, markersize=5, transform=axes.get_xaxis_transform(), clip_on=False)
     if not drawn and not failures:
@@ -85,25 +85,35 @@ def _draw_ratios(axes: "Axes", summary: StudySummary) -> None:
     variants = summary.compared()
     step = _WIDTH / len(study.chosen)
     for variant, where, one in compared:
-        if one.ratio is None:
-            continue
         rank = study.chosen.index(variant)
         x = places.index(where) + (variants.index(variant) - 0.5 * (len(variants) - 1)) * step
         colour = COLOURS[rank % len(COLOURS)]
-        if one.low is not None and one.high is not None and math.isfinite(one.high):
-            axes.plot([x, x], [one.low, one.high], color=colour, linewidth=1.4)
-        axes.plot(x, one.ratio, "o", color=colour, markersize=5)
+        pairs, medians = one.of_pairs, one.of_medians
+        if medians is not None:
+            axes.plot(x, medians.value, "_", color=colour, markersize=11, markeredgewidth=1.6)
+        if pairs is None or pairs.value == 0.0:
+            continue
+        if pairs.low and pairs.high is not None and math.isfinite(pairs.high):
+            axes.plot([x, x], [pairs.low, pairs.high], color=colour, linewidth=1.4)
+        axes.plot(x, pairs.value, "o", color=colour, markersize=5)
         if one.p_value is not None and one.p_value < 0.05:
-            axes.plot(x, one.ratio, "o", color=colour, markersize=9, fillstyle="none")
+            axes.plot(x, pairs.value, "o", color=colour, markersize=9, fillstyle="none")
     axes.axhline(1.0, color="#7a7a7a", linewidth=1.0)
-    axes.set_yscale("log")
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter("{x:g}")
-    axes.tick_params(axis="y", which="minor", labelsize=7.5)
+    _use_logarithm(axes, (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 7.0, 8.0))
     axes.set_title(f"{column.title.partition(' [')[0]} / {study.baseline}")
-    told = "ratio of medians, 95 % interval; ringed: p < 0.05"
+    told = "dots: median of the ratios of pairs, 95 %, ringed: p < 0.05; dashes: ratio of medians"
     axes.text(1.0, 1.015, told, transform=axes.transAxes, ha="right", fontsize=7.5, color="#7a7a7a")
     _label(axes, places)
+
+
+def _use_logarithm(axes: "Axes", ticks: tuple[float, ...]) -> None:
+    """Ticks at these multiples of powers of ten, as plain numbers."""
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=ticks))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_locator(NullLocator())
 
 
 def _label(axes: "Axes", names: list[str]) -> None:

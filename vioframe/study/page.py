@@ -112,10 +112,12 @@ def _comparisons(summary: StudySummary, column: Column) -> Iterator[str]:
     if not found:
         return
     yield f"<h3>Beside {escape(str(summary.study.baseline))}</h3>"
+    heads = ("ratio of medians", "median of ratios", "better", "worse", "pairs", "p")
     yield "<div class=scroll><table><thead><tr><th class=name>variant</th><th class=name>at</th>"
-    yield "<th>ratio of medians</th><th>better</th><th>worse</th><th>pairs</th><th>p</th></tr></thead><tbody>"
+    yield "".join(f"<th>{head}</th>" for head in heads) + "</tr></thead><tbody>"
     for variant, where, compared in found:
-        numbers = (show_ratio(compared), compared.better, compared.worse, compared.pairs, show_p(compared.p_value))
+        ratios = show_ratio(compared.of_medians), show_ratio(compared.of_pairs)
+        numbers = (*ratios, compared.better, compared.worse, compared.pairs, show_p(compared.p_value))
         cells = "".join(f"<td>{escape(str(number))}</td>" for number in numbers)
         yield f"<tr><td class=name>{escape(variant)}</td><td class=name>{escape(where)}</td>{cells}</tr>"
     yield "</tbody></table></div><p class=note>Pairs: runs of the same recording, seed and condition. In brackets the "
@@ -125,8 +127,13 @@ def _comparisons(summary: StudySummary, column: Column) -> Iterator[str]:
 
 def _plain(compared: PairedComparison) -> dict[str, object]:
     """JSON knows no infinity."""
-    numbers = asdict(compared)
-    return {name: None if number == math.inf else number for name, number in numbers.items()}
+    return {name: _finite(value) for name, value in asdict(compared).items()}
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, dict):
+        return {name: _finite(inner) for name, inner in value.items()}
+    return None if isinstance(value, float) and math.isinf(value) else value
 
 
 def _cell(summary: StudySummary, variant: str, value: Value, column: Column) -> str:

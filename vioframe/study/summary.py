@@ -97,9 +97,9 @@ class StudySummary:
         losses = []
         for run, number in self._by_run(variant, value, column).items():
             beside = reference.get(run)
-            if number is None or not beside or not math.isfinite(beside):
+            if number is None or not beside:
                 return None
-            losses.append((number / beside - 1.0) * (1.0 if column.lower_is_better else -1.0))
+            losses.append(_loss(number, beside) * (1.0 if column.lower_is_better else -1.0))
         return median(losses) if losses else None
 
     def compared(self) -> list[str]:
@@ -168,10 +168,10 @@ class StudySummary:
         told: dict[str, list[str]] = {}
         for variant, where, compared in self.comparisons(column):
             if where.startswith("all but ") or where == self.study.shown(self.study.reference):
-                told.setdefault(variant, []).append(f"{compared.sentence()} at {where}")
+                told.setdefault(variant, []).append(f"at {where} {compared.sentence()}")
         name = _with_unit(column.title)[0]
         for variant, parts in told.items():
-            said.append(f"{name} of {variant} / {self.study.baseline}, ratio of medians: {'; '.join(parts)}.")
+            said.append(f"{name} of {variant} / {self.study.baseline}: {'; '.join(parts)}.")
         return said
 
     def _sentence(self, variant: str, column: Column) -> str:
@@ -229,8 +229,9 @@ class StudySummary:
                     numbers[f"{variant}/{column.key}"] = spread.median / column.factor
         for variant, where, compared in self.comparisons(self.columns[0]):
             place = f"{variant}/{self.columns[0].key}.beside_{self.study.baseline}"
-            if compared.ratio is not None:
-                numbers[f"{place}/{where}/ratio"] = compared.ratio
+            for name, ratio in (("ratio_of_medians", compared.of_medians), ("median_ratio", compared.of_pairs)):
+                if ratio is not None:
+                    numbers[f"{place}/{where}/{name}"] = ratio.value
             if compared.p_value is not None:
                 numbers[f"{place}/{where}/p"] = compared.p_value
         return numbers
@@ -260,6 +261,13 @@ class StudySummary:
 
     def _too_short(self, result: CellResult) -> bool:
         return result.status == "finished" and result.metrics.get("completion", 1.0) < self.study.least_completion
+
+
+def _loss(number: float, beside: float) -> float:
+    """Relative to ``beside``; of two of which one failed, the other is infinitely far away, and two alike are alike."""
+    if math.isinf(beside) or math.isinf(number):
+        return 0.0 if number == beside else math.copysign(math.inf, number - beside)
+    return number / beside - 1.0
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -36,11 +36,14 @@ def print_study(summary: StudySummary, console: "Console | None" = None) -> None
                 continue
             within = loss is not None and loss <= study.tolerance and math.isfinite(spread.median)
             text = spread.text(spread.median, column.decimals)
-            if spread.failed:
-                text += f" ({spread.failed} of {spread.runs} failed)"
+            if spread.failed and math.isfinite(spread.median):
+                text += f" ×{spread.failed}"
             cells.append(Text(text, style="green" if within else ""))
         table.add_row(Text(variant), *cells)
     console.print(table)
+    if study.least_completion > 0.0:
+        told = f"×: runs that tracked less than {100.0 * study.least_completion:g} % of their recording, and failed"
+        console.print(told, style="dim", highlight=False)
     _print_comparisons(summary, console)
     for sentence in summary.sentences():
         console.print(sentence, markup=False, highlight=False)
@@ -60,10 +63,20 @@ def _print_comparisons(summary: StudySummary, console: "Console") -> None:
         return
     title = f"{column.title}, beside {summary.study.baseline}, pairs of the same recording and seed"
     table = Table(title=Text(title), title_justify="left")
-    for head in ("variant", "at", "ratio of medians (95 %)", "better", "worse", "pairs", "p"):
+    for head in (
+        "variant",
+        "at",
+        "ratio of medians (95 %)",
+        "median of ratios (95 %)",
+        "better",
+        "worse",
+        "pairs",
+        "p",
+    ):
         table.add_column(head, justify="left" if head in ("variant", "at") else "right")
     for variant, where, compared in found:
         counts = (compared.better, compared.worse, compared.pairs)
-        table.add_row(variant, where, show_ratio(compared), *map(str, counts), show_p(compared.p_value))
+        shown = show_ratio(compared.of_medians), show_ratio(compared.of_pairs)
+        table.add_row(variant, where, *shown, *map(str, counts), show_p(compared.p_value))
     console.print(table)
     console.print("p: Wilcoxon's signed-rank test, two-sided, each by itself", style="dim", highlight=False)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import wilcoxon
 
-from vioframe.evaluation.paired import PairedComparison, compare_pairs, show_p, show_ratio
+from vioframe.evaluation.paired import Ratio, compare_pairs, show_p, show_ratio
 
 
 def pairs(values):
@@ -17,7 +17,8 @@ def test_ratio_and_counts_of_a_constant_factor():
     base = pairs([0.1, 0.2, 0.05, 0.4, 0.3, 0.15])
     half = {key: 0.5 * value for key, value in base.items()}
     found = compare_pairs(base, half)
-    assert found.ratio == pytest.approx(0.5)
+    assert found.of_medians.value == pytest.approx(0.5)
+    assert (found.of_pairs.low, found.of_pairs.high) == pytest.approx((0.5, 0.5))
     assert (found.better, found.worse, found.pairs) == (6, 0, 6)
     # All six of one sign: 2 of the 64 equally likely patterns of signs are this extreme.
     assert found.p_value == pytest.approx(2 / 64)
@@ -37,7 +38,8 @@ def test_exchanged_systems_give_the_inverse():
     rng = np.random.default_rng(1)
     first, second = pairs(rng.lognormal(size=11)), pairs(rng.lognormal(size=11))
     there, back = compare_pairs(first, second), compare_pairs(second, first)
-    assert there.ratio == pytest.approx(1.0 / back.ratio)
+    assert there.of_medians.value == pytest.approx(1.0 / back.of_medians.value)
+    assert there.of_pairs.value == pytest.approx(1.0 / back.of_pairs.value)
     assert (there.better, there.worse) == (back.worse, back.better)
     assert there.p_value == pytest.approx(back.p_value)
 
@@ -45,7 +47,17 @@ def test_exchanged_systems_give_the_inverse():
 def test_equal_systems_are_not_told_apart():
     base = pairs([0.1, 0.2, 0.3])
     found = compare_pairs(base, base)
-    assert found == PairedComparison(pairs=3, better=0, worse=0, ratio=1.0, low=1.0, high=1.0, p_value=1.0)
+    same = Ratio(value=1.0, low=1.0, high=1.0)
+    assert (found.better, found.worse, found.of_pairs, found.p_value) == (0, 0, same, 1.0)
+    assert found.of_medians.value == 1.0
+
+
+def test_pairs_see_what_medians_of_all_recordings_hide():
+    """Recordings differ by more than systems do: the middle run of each need not be of the same recording."""
+    base = pairs([1.0, 1.1, 1.2, 10.0, 11.0])
+    found = compare_pairs(base, {0: 1.3, 1: 1.4, 2: 1.15, 3: 12.0, 4: 12.0})
+    assert found.of_pairs.value == pytest.approx(1.2)
+    assert found.of_medians.value == pytest.approx(1.4 / 1.2)
 
 
 def test_chance_is_called_significant_as_often_as_it_says():
@@ -58,13 +70,14 @@ def test_chance_is_called_significant_as_often_as_it_says():
 
 def test_interval_holds_the_true_ratio_about_as_often_as_it_says():
     rng = np.random.default_rng(3)
-    held = []
+    medians, within = [], []
     for _ in range(120):
         first = rng.lognormal(sigma=0.5, size=25)
         second = 0.8 * first * rng.lognormal(sigma=0.2, size=25)
         found = compare_pairs(pairs(first), pairs(second))
-        held.append(found.low <= 0.8 <= found.high)
-    assert np.mean(held) > 0.88
+        medians.append(found.of_medians.low <= 0.8 <= found.of_medians.high)
+        within.append(found.of_pairs.low <= 0.8 <= found.of_pairs.high)
+    assert np.mean(medians) > 0.88 and np.mean(within) > 0.88
 
 
 def test_failed_run_is_worse_than_any_other():
@@ -72,8 +85,8 @@ def test_failed_run_is_worse_than_any_other():
     one_failed = {**base, 4: math.inf}
     found = compare_pairs(base, one_failed)
     assert (found.better, found.worse) == (0, 1)
-    assert found.ratio == 1.0 and math.isinf(found.high)
-    assert "∞" in show_ratio(found)
+    assert found.of_medians.value == found.of_pairs.value == 1.0 and math.isinf(found.of_pairs.high)
+    assert "∞" in show_ratio(found.of_pairs)
     # A failure outranks the largest finite difference, whatever that is.
     gain = {key: 1e-3 * value for key, value in base.items()}
     assert compare_pairs(base, {**gain, 4: math.inf}).p_value == pytest.approx(wilcoxon([-1, -1, -1, -1, 9]).pvalue)
@@ -83,8 +96,9 @@ def test_failed_run_is_worse_than_any_other():
 
 def test_half_of_the_runs_failed_leaves_no_ratio():
     found = compare_pairs(pairs([0.1, 0.2]), pairs([0.1, math.inf]))
-    assert found.ratio is None and found.low is None and show_ratio(found) == "no ratio"
-    assert compare_pairs(pairs([math.inf, math.inf]), pairs([0.1, 0.2])).ratio is None
+    assert found.of_medians is None and found.of_pairs is None and show_ratio(None) == "none"
+    healed = compare_pairs(pairs([math.inf, math.inf]), pairs([0.1, 0.2]))
+    assert healed.of_medians is None and healed.of_pairs.value == 0.0
 
 
 def test_only_what_both_have_is_compared_and_nothing_is_no_error():
@@ -100,6 +114,11 @@ def test_where_more_is_better_a_gain_is_better_and_zero_may_occur():
 
 
 def test_words():
-    assert show_p(0.00001) == "<0.001" and show_p(0.034) == "0.034" and show_p(None) == "–"
+    assert show_p(0.00001) == "< 0.001" and show_p(0.034) == "0.034" and show_p(None) == "–"
     found = compare_pairs(pairs([2.0, 2.0]), pairs([1.0, 1.0]))
-    assert found.sentence() == "0.50 (0.50…0.50), better in 2 and worse in 0 of 2, p = 0.5"
+    assert found.sentence() == (
+        "ratio of medians 0.50 (0.50…0.50), median of the ratios 0.50 (0.50…0.50), "
+        "better in 2 and worse in 0 of 2, p = 0.5"
+    )
+    many = compare_pairs(pairs([2.0] * 20), pairs([1.0] * 20))
+    assert many.sentence().endswith("p < 0.001")
