@@ -209,8 +209,8 @@ class SuperPointFrontend(DescriptorFrontend):
                 for camera, mask in enumerate(self.masks)
             ]
             found += [
-                self.follow(frame, gray[0], points, None)
-                for frame, gray, *points in zip(part, grays, *seen, strict=True)
+                self.follow(frame, images, points, None)
+                for frame, images, *points in zip(part, grays, *seen, strict=True)
             ]
         return found
 

@@ -100,7 +100,7 @@ class DescriptorFrontend(Frontend):
         """
         grays = self.gray_images(frame)
         keypoints = [self._extractor.extract(gray, mask) for gray, mask in zip(grays, self.masks, strict=True)]
-        return self.follow(frame, grays[0], keypoints, R_prev_cur)
+        return self.follow(frame, grays, keypoints, R_prev_cur)
 
     @property
     def masks(self) -> list[np.ndarray]:
@@ -119,13 +119,13 @@ class DescriptorFrontend(Frontend):
         return [normalise_exposure(gray) for gray in grays] if self._normalise else grays
 
     def follow(
-        self, frame: Frame, gray: Image, keypoints: Sequence[Keypoints], R_prev_cur: Array | None
+        self, frame: Frame, grays: Sequence[Image], keypoints: Sequence[Keypoints], R_prev_cur: Array | None
     ) -> VisualFeatures:
         """What :meth:`process` returns.
 
         Args:
             frame: the next.
-            gray: its image of camera 0, as :meth:`gray_images` has it.
+            grays: its images, as :meth:`gray_images` has them.
             keypoints: that were found in the image of each camera.
             R_prev_cur: as of :meth:`process`.
         """
@@ -138,7 +138,7 @@ class DescriptorFrontend(Frontend):
         ids, index, ages = self._keeper.keep(keypoints[0], bearings, R_cam)
         pixels, bearings = keypoints[0].pixels[index], bearings[index]
         if self._places is not None:
-            pixels, slipped = self._places.place(gray, ids, pixels)
+            pixels, slipped = self._places.place(grays[0], ids, pixels)
             self._keeper.forget(ids[slipped])
             ids, index, ages, pixels = ids[~slipped], index[~slipped], ages[~slipped], pixels[~slipped]
             bearings = projection.bearings(camera, pixels)
@@ -152,7 +152,9 @@ class DescriptorFrontend(Frontend):
             scores=ages.astype(float),
             descriptors=points.descriptors,
         )
-        stereo = self._match_stereo(tracks, self._pair, points, keypoints[1]) if self._pair is not None else None
+        stereo = None
+        if self._pair is not None:
+            stereo = self._match_stereo(tracks, self._pair, points, keypoints[1], grays[1])
         rest = np.setdiff1d(np.arange(len(keypoints[0])), index)
         return VisualFeatures(frame=frame, tracks=tracks, stereo=stereo, untracked=keypoints[0].select(rest))
 
@@ -161,7 +163,9 @@ class DescriptorFrontend(Frontend):
             raise StateError(f"{type(self).__name__}.process was called before setup(rig): set it up first")
         return self._camera
 
-    def _match_stereo(self, tracks: Tracks, pair: TwoCameras, points: Keypoints, keypoints: Keypoints) -> Tracks:
+    def _match_stereo(
+        self, tracks: Tracks, pair: TwoCameras, points: Keypoints, keypoints: Keypoints, gray: Image
+    ) -> Tracks:
         """The points that camera 1 sees too."""
         bearings = projection.bearings(self._cameras[1], keypoints.pixels)
         rows, columns = pair.possible_pairs(tracks.bearings, bearings)
@@ -173,10 +177,15 @@ class DescriptorFrontend(Frontend):
             max_distance=self._options.max_distance,
             ratio=self._options.ratio,
         )
+        pixels, bearings = keypoints.pixels[columns], bearings[columns]
+        if self._places is not None:
+            pixels, slipped = self._places.place_elsewhere(gray, tracks.ids[rows], pixels)
+            rows, columns, pixels = rows[~slipped], columns[~slipped], pixels[~slipped]
+            bearings = projection.bearings(self._cameras[1], pixels)
         return Tracks(
             ids=tracks.ids[rows],
-            pixels=keypoints.pixels[columns],
-            bearings=bearings[columns],
+            pixels=pixels,
+            bearings=bearings,
             scores=tracks.scores[rows],
             descriptors=keypoints.descriptors[columns],
             camera=1,

@@ -79,7 +79,10 @@ class AnchoredPlaces:
         keep = self._absent < self._options.memory_images
         keep[rows] = True
         if len(rows):
-            found, fits, worn = self._align(gray, pixels[seen], rows)
+            found, fits, bend = self._align(gray, pixels[seen], rows)
+            self._anchors.bend[rows[fits]] = bend[fits]
+            stretch = np.linalg.svd(bend, compute_uv=False)
+            worn = (stretch[:, 0] > _MAX_STRETCH) | (stretch[:, 1] < 1.0 / _MAX_STRETCH)
             if fits.mean() >= _FEW_FIT:
                 placed[seen] = found
                 slipped[seen[~fits]] = True
@@ -98,14 +101,26 @@ class AnchoredPlaces:
         self._absent = np.concatenate([self._absent[keep], np.zeros(len(fresh), dtype=np.int64)])
         return placed, slipped
 
-    def _align(self, gray: Image, pixels: Array, rows: np.ndarray) -> tuple[Array, Mask, Mask]:
-        """Places (K, 2), which patches fit there (K,), and which of these are seen much larger or smaller (K,)."""
+    def place_elsewhere(self, gray: Image, ids: Stamps, pixels: Array) -> tuple[Array, Mask]:
+        """The same in an image that another camera took at the instant of the last one, with nothing remembered of it.
+
+        Args:
+            gray: (H, W) uint8.
+            ids: (M,) of points of the last image.
+            pixels: (M, 2) px where they were found.
+        """
+        rows = np.searchsorted(self._ids, ids)
+        placed, fits, _ = self._align(gray, pixels, rows)
+        if len(rows) and fits.mean() < _FEW_FIT:
+            return pixels, np.zeros(len(ids), dtype=bool)
+        return placed, ~fits
+
+    def _align(self, gray: Image, pixels: Array, rows: np.ndarray) -> tuple[Array, Mask, np.ndarray]:
+        """Places (K, 2), which patches fit there (K,), and their warps (K, 2, 2), of others the last."""
         options = self._options
         found, bend, correlation = self._anchors.align(gray, pixels, self._anchors.bend[rows], options.steps, rows)
         with np.errstate(invalid="ignore"):
             near = np.linalg.norm(found - pixels, axis=-1) < options.reach_px
             fits: Mask = np.asarray(near & (correlation > options.min_correlation))
-        self._anchors.bend[rows[fits]] = bend[fits]
-        stretch = np.linalg.svd(np.where(fits[:, None, None], bend, np.eye(2)), compute_uv=False)
-        worn = (stretch[:, 0] > _MAX_STRETCH) | (stretch[:, 1] < 1.0 / _MAX_STRETCH)
-        return np.where(fits[:, None], found, pixels), fits, worn
+        bend = np.where(fits[:, None, None], bend, self._anchors.bend[rows])
+        return np.where(fits[:, None], found, pixels), fits, bend

@@ -73,6 +73,18 @@ def test_a_point_comes_back_and_one_long_gone_does_not(texture):
     assert np.array_equal(placed[30:], pixels[30:] + 0.4), "they begin anew where they are found"
 
 
+def test_the_other_camera_is_placed_by_the_same_patches(texture):
+    places, pixels, ids = AnchoredPlaces(OPTIONS), points(), np.arange(60)
+    places.place(shifted(texture, 0, 0), ids, pixels)
+    found = pixels[::2] + np.array([-7.3, 0.5])
+    found[:5] += 8.0
+    placed, slipped = places.place_elsewhere(shifted(texture, -7.3, 0, 0.7), ids[::2], found)
+    assert slipped[:5].sum() >= 4 and not slipped[5:].any()
+    assert np.linalg.norm(placed[5:] - pixels[::2][5:] - np.array([-7.3, 0.0]), axis=1).max() < 0.1
+    again, _ = places.place(shifted(texture, 0, 0), ids, pixels + 0.3)
+    assert np.linalg.norm(again - pixels, axis=1).max() < 0.1
+
+
 def test_no_points_are_no_trouble(texture):
     places, none = AnchoredPlaces(OPTIONS), np.zeros((0, 2))
     image = shifted(texture, 0, 0)
