@@ -8,7 +8,7 @@
 ``labels``      labelled pictures on disk, and points as classes of cells
 ``adaptation``  homographic adaptation of one picture; ``labelling``: of all of them; ``sources``: which they are
 ``data``        batches by the number of their iteration
-``module``      net, loss and learning rate as lightning has them; ``loop``: a stage; ``watching``: its callbacks
+``steps``       the loss of a step; ``schedule``: the learning rate; ``loop``: a stage; ``bar``: on the terminal
 ``validation``  how good the net is while it learns; ``drawing``: what it finds
 ==============  =======================================================================================
 """

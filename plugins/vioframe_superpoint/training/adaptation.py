@@ -9,9 +9,9 @@ from vioframe.pictures import sample_homography, valid_mask, warp_picture
 from vioframe.types import Image
 from vioframe_superpoint.net.keypoints import heatmap, suppress
 from vioframe_superpoint.net.superpoint import SuperPointNet
-from vioframe_superpoint.training.module import as_float
 from vioframe_superpoint.training.options import AdaptationOptions
 from vioframe_superpoint.training.precision import autocast
+from vioframe_superpoint.training.steps import as_float
 
 # px, half the side of the square over which a maximum of the mean heat is placed between pixels.
 _REACH = 2

@@ -1,12 +1,12 @@
 """Batches of the stages: each a pure function of the seed and the number of the iteration."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset
 
 from vioframe.checks import Array
 from vioframe_superpoint.synthetic import SyntheticShapes
@@ -19,34 +19,6 @@ MakeBatch = Callable[[int], Mapping[str, Array]]
 
 # What tells the random numbers of one purpose from those of another with the same seed.
 _SHAPES, _PAIRS, _ORDER = 1, 2, 3
-
-
-class BlockSampler(Sampler[int]):
-    """Numbers of iterations, a block after the other: an epoch, as lightning calls it, is a block.
-
-    Args:
-        iterations: of the whole stage.
-        block: iterations of a block; the last may have fewer.
-    """
-
-    def __init__(self, iterations: int, block: int) -> None:
-        self._iterations = iterations
-        self._block = block
-        self._epoch = 0
-
-    def set_epoch(self, epoch: int) -> None:
-        """The block that comes next; lightning calls it."""
-        self._epoch = epoch
-
-    def __len__(self) -> int:
-        return len(self._numbers())
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self._numbers())
-
-    def _numbers(self) -> range:
-        first = self._epoch * self._block
-        return range(first, min(first + self._block, self._iterations))
 
 
 class Batches(Dataset[Mapping[str, Tensor]]):
@@ -121,13 +93,13 @@ class PairBatches:
         return int(self._deck[1][position])
 
 
-def loader(make: MakeBatch, iterations: int, block: int, workers: int) -> DataLoader[Any]:
-    """The batches of a stage, in order, made by ``workers`` processes beside the training."""
+def loader(make: MakeBatch, iterations: Sequence[int], workers: int) -> DataLoader[Any]:
+    """The batches of iterations, in order, made by ``workers`` processes beside the training."""
     helped = workers > 0
     return DataLoader(
         Batches(make),
         batch_size=None,
-        sampler=BlockSampler(iterations, block),
+        sampler=iterations,
         num_workers=workers,
         persistent_workers=helped,
         prefetch_factor=4 if helped else None,

@@ -3,18 +3,16 @@
 import logging
 import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from vioframe.pictures import PictureSource
 from vioframe_superpoint.net.superpoint import SuperPointNet
 from vioframe_superpoint.training.adaptation import adapted_heat, points_of
+from vioframe_superpoint.training.bar import Bar
 from vioframe_superpoint.training.labels import LabelStore
 from vioframe_superpoint.training.options import AdaptationOptions
-from vioframe_superpoint.training.watching import Bar
-
-if TYPE_CHECKING:
-    from vioframe.pictures.sources import PictureSource
 
 log = logging.getLogger(__name__)
 
@@ -25,7 +23,7 @@ _LABELS = 4
 
 def label_pictures(
     store: LabelStore,
-    source: "PictureSource",
+    source: PictureSource,
     net: SuperPointNet,
     options: AdaptationOptions,
     *,
@@ -63,7 +61,7 @@ def label_pictures(
         for chunk, first in enumerate(range(0, total, CHUNK)):
             if store.has(chunk):
                 continue
-            if until is not None and time.monotonic() >= until:
+            if made and until is not None and time.monotonic() >= until:
                 return False
             started = time.perf_counter()
             pictures, points = [], []

@@ -1,24 +1,26 @@
 """Which pictures are labelled and learned from."""
 
-from typing import TYPE_CHECKING
-
+from vioframe.errors import DataError
+from vioframe.pictures import Mixture, PictureFolder, PictureSource, RenderedPlaces, Textures
 from vioframe_superpoint.training.options import PictureOptions
 
-if TYPE_CHECKING:
-    from vioframe.pictures.sources import PictureSource
 
+def picture_source(options: PictureOptions, seed: int) -> PictureSource:
+    """The pictures to learn from, and after them those of validation.
 
-def picture_source(options: PictureOptions, seed: int) -> "PictureSource":
-    """The pictures, those of validation last; a folder with fewer begins again."""
-    from vioframe.pictures.places import RenderedPlaces
-    from vioframe.pictures.sources import Mixture, PictureFolder, PictureSource, Textures
-
-    size_px = int(options.size_px[0]), int(options.size_px[1])
+    Raises:
+        DataError: a folder without enough pictures.
+    """
     count = options.count + options.held_out
     if options.folder is not None:
-        return Mixture([PictureFolder(options.folder, size_px=size_px)], [1.0], count=count)
-    generated: list[PictureSource] = [
-        RenderedPlaces(size_px=size_px, count=count, seed=seed),
-        Textures(size_px=size_px, count=count, seed=seed),
-    ]
-    return Mixture(generated, [options.places, 1.0 - options.places], count=count, seed=seed)
+        folder = PictureFolder(options.folder, size_px=options.size_px)
+        if len(folder) < count:
+            raise DataError(
+                f"frontend.training.pictures.folder={options.folder} holds {len(folder)} pictures, but "
+                f"{options.count} are to be learned from and {options.held_out} held out: ask for fewer "
+                "(frontend.training.pictures.count)"
+            )
+        return Mixture([folder], [1.0], count=count, seed=seed)
+    places = RenderedPlaces(size_px=options.size_px, count=count, seed=seed)
+    textures = Textures(size_px=options.size_px, count=count, seed=seed)
+    return Mixture([places, textures], [options.places, 1.0 - options.places], count=count, seed=seed)

@@ -14,11 +14,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-import lightning
 import torch
 
 from vioframe import __version__
-from vioframe.errors import DataError
 from vioframe.learning.seeding import seed_everything
 from vioframe.learning.weights import load_weights, locate_weights, read_card, save_weights
 from vioframe.tracking import Tracker
@@ -27,13 +25,13 @@ from vioframe_superpoint.options import Encoder
 from vioframe_superpoint.training.data import MakeBatch, PairBatches, ShapeBatches
 from vioframe_superpoint.training.labelling import label_pictures
 from vioframe_superpoint.training.labels import LabelledPictures, LabelStore
-from vioframe_superpoint.training.loop import fit_stage, stage_of
-from vioframe_superpoint.training.module import JointLoss, RateOptions, StageModule, StepLoss, shapes_loss
+from vioframe_superpoint.training.loop import RESUME_FILE, Loop, Progress, Session, Stage, StepLoss, read_resume
 from vioframe_superpoint.training.options import TrainingOptions, plain_values
 from vioframe_superpoint.training.precision import resolve_precision
+from vioframe_superpoint.training.schedule import RateOptions
 from vioframe_superpoint.training.sources import picture_source
+from vioframe_superpoint.training.steps import JointLoss, shapes_loss
 from vioframe_superpoint.training.validation import PairValidation, ShapesValidation, validation_pairs
-from vioframe_superpoint.training.watching import RESUME_FILE, KeepBest, Progress, ResumePoint
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +67,7 @@ class Training:
         resume: go on from the resume file of the folder.
 
     Raises:
-        DataError: the resume file is not whole, or was written with other options.
+        DataError: the resume file is not whole.
     """
 
     def __init__(
@@ -87,22 +85,20 @@ class Training:
         self._encoder = encoder
         self._architecture = architecture
         self._options = options
-        self._device = device
-        self._precision = resolve_precision(options.precision, device)
         self._folder = folder
-        self._tracker = tracker
-        self._shown = shown
+        self._session = Session(
+            device=device,
+            precision=resolve_precision(options.precision, device),
+            workers=options.workers,
+            folder=folder,
+            tracker=tracker,
+            shown=shown,
+            until=None if options.max_minutes is None else time.monotonic() + 60.0 * options.max_minutes,
+        )
         self._store = LabelStore(folder / "labels" if options.labels is None else Path(options.labels).expanduser())
         self._resume: tuple[str, Path] | None = None
         if resume:
-            stage, _, block = stage_of(folder / RESUME_FILE)
-            if block != options.save_every:
-                raise DataError(
-                    f"trainer.resume={folder / RESUME_FILE} was written with frontend.training.save_every={block}, not "
-                    f"{options.save_every}: a training that goes on keeps it"
-                )
-            self._resume = (stage, folder / RESUME_FILE)
-        self._until = None if options.max_minutes is None else time.monotonic() + 60.0 * options.max_minutes
+            self._resume = (str(read_resume(folder / RESUME_FILE)["stage"]), folder / RESUME_FILE)
 
     def run(self) -> Path | None:
         """Train, as far as the time allows.
@@ -139,18 +135,18 @@ class Training:
         return label_pictures(
             self._store,
             source,
-            net.net.to(self._device),
+            net.net.to(self._session.device),
             self._options.adaptation,
             seed=self._options.seed,
-            precision=self._precision,
+            precision=self._session.precision,
             about={
                 "detector": {"architecture": dict(self._architecture), **about},
                 "pictures": plain_values(pictures),
                 "adaptation": plain_values(self._options.adaptation),
                 "seed": self._options.seed,
             },
-            until=self._until,
-            shown=self._shown,
+            until=self._session.until,
+            shown=self._session.shown,
         )
 
     def _train_on_shapes(self, net: NamedNet) -> bool:
@@ -229,7 +225,7 @@ class Training:
 
     def _fit(
         self,
-        stage: str,
+        name: str,
         net: NamedNet,
         loss: StepLoss,
         make: MakeBatch,
@@ -241,78 +237,58 @@ class Training:
         rate_key: str,
     ) -> bool:
         """Train through a stage, or go on with it; whether it is done."""
-        resume = self._resume[1] if self._resume is not None and self._resume[0] == stage else None
         options = self._options
-        module = StageModule(net.net, loss, rate)
-        figures: dict[str, float] = {}
 
         def validate(iteration: int) -> Mapping[str, float]:
-            net.net.eval()
-            try:
-                figures.clear()
-                figures.update(validation.figures())
-                picture = self._folder / "pictures" / f"{stage}-{iteration:06d}.png"
-                validation.draw(picture)
-                self._tracker.log_file(picture, "pictures")
-            finally:
-                net.net.train()
-            return figures
+            picture = self._folder / "pictures" / f"{name}-{iteration:06d}.png"
+            validation.draw(picture)
+            self._session.tracker.log_file(picture, "pictures")
+            return validation.figures()
 
-        progress = Progress(
-            stage,
-            rate.iterations,
-            options.save_every,
-            validate=validate,
-            every=options.validate_every,
-            folder=self._folder,
-            tracker=self._tracker,
-            shown=self._shown,
-            rate_key=rate_key,
-        )
-
-        def save(iteration: int) -> None:
+        def keep(progress: Progress, figures: Mapping[str, float]) -> None:
             card = {
-                "stage": stage,
-                "iteration": iteration,
+                "stage": name,
+                "iteration": progress.iteration,
                 "iterations": rate.iterations,
                 "hours": progress.seconds / 3600.0,
                 "validation": dict(figures),
                 **about,
-                "precision": self._precision,
-                "machine": _machine(self._device),
-                "code": {"vioframe": __version__, "torch": torch.__version__, "lightning": lightning.__version__},
+                "precision": self._session.precision,
+                "machine": _machine(self._session.device),
+                "code": {"vioframe": __version__, "torch": torch.__version__},
                 "licence": _LICENCE,
                 "made": datetime.now(UTC).isoformat(timespec="seconds"),
             }
             save_weights(best, net, card)
 
-        keep = KeepBest(progress, save)
-        point = ResumePoint(self._folder, self._until)
-        log.info(
-            "%s: %d iterations%s, %s on %s",
-            stage,
-            rate.iterations,
-            "" if resume is None else f", going on after {stage_of(resume)[1]}",
-            self._precision,
-            self._device,
-        )
-        net.net.to(self._device)
-        fit_stage(
-            module,
-            make,
-            iterations=rate.iterations,
-            block=options.save_every,
-            workers=options.workers,
-            device=self._device,
-            precision=self._precision,
+        stage = Stage(
+            name=name,
+            loss=loss,
+            make=make,
+            rate=rate,
             gradient_clip=options.gradient_clip,
-            folder=self._folder,
-            resume=resume,
-            watchers=(progress, keep, point),
+            save_every=options.save_every,
+            validate_every=options.validate_every,
+            validate=validate,
+            keep=keep,
+            rate_key=rate_key,
         )
-        if (self._folder / f"{stage}.csv").exists():
-            self._tracker.log_file(self._folder / f"{stage}.csv")
-        return not point.stopped
+        loop = Loop(net.net.to(self._session.device), stage, self._session)
+        if self._resume is not None and self._resume[0] == name:
+            loop.resume(self._resume[1])
+        log.info(
+            "%s: %d of %d iterations are done; %s on %s",
+            name,
+            loop.progress.iteration,
+            rate.iterations,
+            self._session.precision,
+            self._session.device.type,
+        )
+        done = loop.run()
+        curve = self._folder / f"{name}.csv"
+        if curve.exists():
+            self._session.tracker.log_file(curve)
+        return done
 
 
 def _machine(device: torch.device) -> dict[str, object]:

@@ -17,8 +17,8 @@ from vioframe_superpoint.net.keypoints import heatmap, remove_border, sample_des
 from vioframe_superpoint.net.superpoint import SuperPointNet
 from vioframe_superpoint.synthetic import SyntheticShapes
 from vioframe_superpoint.training.adaptation import refined
-from vioframe_superpoint.training.module import as_float
 from vioframe_superpoint.training.options import ShapesOptions
+from vioframe_superpoint.training.steps import as_float
 
 _POINTS = 300
 _RADIUS_PX = 4

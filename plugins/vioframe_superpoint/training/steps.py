@@ -1,0 +1,65 @@
+"""The loss of a step of either stage of training."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from vioframe_superpoint.training.losses import descriptor_loss, detector_loss
+from vioframe_superpoint.training.options import DescriptorLoss
+
+
+def shapes_loss(net: nn.Module, batch: Mapping[str, Tensor], iteration: int) -> dict[str, Tensor]:
+    """Of the first stage: the detector's alone.
+
+    Args:
+        net: SuperPoint's.
+        batch: ``images`` (B, H, W) uint8 and ``classes`` (B, h, w).
+        iteration: does not matter.
+    """
+    logits = net.detector(net.encoder(as_float(batch["images"])))  # type: ignore[operator]
+    classes = batch["classes"]
+    return {"loss": detector_loss(logits, classes, torch.ones_like(classes, dtype=torch.bool))}
+
+
+class JointLoss:
+    """Of the third stage, on a batch of pairs: ``L_p + L_p' + λ L_d``.
+
+    Args:
+        options: of the descriptors' loss, with λ.
+    """
+
+    def __init__(self, options: DescriptorLoss) -> None:
+        self._options = options
+
+    def __call__(self, net: nn.Module, batch: Mapping[str, Tensor], iteration: int) -> dict[str, Tensor]:
+        """Losses of a batch, as :class:`~vioframe_superpoint.training.pairs.Pair` has it with an axis in front."""
+        images = batch["images"]
+        pairs = images.shape[0]
+        # Both views in one pass, the first ones first.
+        logits, maps = net(as_float(images.transpose(0, 1).flatten(0, 1)))
+        classes, whole = batch["classes"], batch["whole"]
+        detectors = [detector_loss(logits[at], classes[:, view], whole[:, view]) for view, at in _views(pairs)]
+        points, overlap = batch["points"], batch["overlap"]
+        descriptors = descriptor_loss(
+            self._options,
+            maps[:pairs],
+            maps[pairs:],
+            batch["H"],
+            points=(points[:, 0], points[:, 1]),
+            matched=batch["matched"],
+            valid=(overlap[:, 0], overlap[:, 1]),
+            seed=iteration,
+        )
+        detector = detectors[0] + detectors[1]
+        loss = detector + self._options.weight * descriptors
+        return {"loss": loss, "detector": detector, "descriptors": descriptors}
+
+
+def as_float(images: Tensor) -> Tensor:
+    """Grey images (B, 1, H, W) in [0, 1], as they lie best in memory, of (B, H, W) uint8."""
+    return (images[:, None].float() / 255.0).contiguous(memory_format=torch.channels_last)
+
+
+def _views(pairs: int) -> tuple[tuple[int, slice], tuple[int, slice]]:
+    return (0, slice(0, pairs)), (1, slice(pairs, 2 * pairs))

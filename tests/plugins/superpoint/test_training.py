@@ -1,0 +1,361 @@
+"""SuperPoint's training: options, labels, pairs, adaptation, and stages that can be stopped and gone on with."""
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs torch (extra learn)")
+
+from vioframe.errors import ConfigError, DataError  # noqa: E402
+from vioframe.interfaces import TrainsItself  # noqa: E402
+from vioframe.learning.weights import read_card  # noqa: E402
+from vioframe.pictures import HomographyOptions, LightingOptions, warp_points  # noqa: E402
+from vioframe.tracking import NullTracker  # noqa: E402
+from vioframe_superpoint.net.superpoint import make_net  # noqa: E402
+from vioframe_superpoint.options import Encoder  # noqa: E402
+from vioframe_superpoint.training import (  # noqa: E402
+    AdaptationOptions,
+    PairOptions,
+    PictureOptions,
+    ShapesOptions,
+    SparseTripletLoss,
+    TrainingOptions,
+    stages,
+)
+from vioframe_superpoint.training.adaptation import adapted_heat, points_of, refined  # noqa: E402
+from vioframe_superpoint.training.labels import LabelStore, cell_classes, whole_cells  # noqa: E402
+from vioframe_superpoint.training.pairs import make_pair  # noqa: E402
+from vioframe_superpoint.training.schedule import RateOptions, rate_factor  # noqa: E402
+
+STILL = LightingOptions(**{name: 0.0 for name in LightingOptions.__dataclass_fields__})
+ENCODER = Encoder(name="mobilenetv2", width=0.25)
+ARCHITECTURE = {"part": "superpoint", "encoder": "mobilenetv2", "width": 0.25}
+PAIRS = PairOptions(
+    size_px=[64, 48], scale=[0.7, 1.2], homographies=HomographyOptions(), lighting=STILL, matches=24, labelled=0.5
+)
+OPTIONS = TrainingOptions(
+    seed=3,
+    iterations=6,
+    batch_size=2,
+    learning_rate=1e-3,
+    schedule="cosine",
+    warmup=2,
+    weight_decay=0.0,
+    gradient_clip=10.0,
+    save_every=2,
+    validate_every=4,
+    max_minutes=None,
+    precision="32",
+    workers=0,
+    labels=None,
+    detector=None,
+    descriptor_loss=SparseTripletLoss(weight=1.2, margin=1.0, negatives=4, radius_px=8.0, both_ways=True),
+    pictures=PictureOptions(count=4, size_px=[96, 64], folder=None, places=0.0, held_out=2),
+    shapes=ShapesOptions(iterations=4, batch_size=2, size_px=[64, 48], learning_rate=1e-3),
+    adaptation=AdaptationOptions(
+        homographies=4,
+        threshold=0.001,
+        nms_radius_px=4,
+        border_px=3,
+        max_points=50,
+        least_views=0.1,
+        batch_size=2,
+        ranges=HomographyOptions(),
+    ),
+    pairs=PAIRS,
+)
+
+
+class Blocks:
+    """Pictures of grey blocks, each a pure function of its index."""
+
+    def __init__(self, count, size_px=(96, 64)):
+        self._count = count
+        self._size_px = size_px
+
+    def __len__(self):
+        return self._count
+
+    def picture(self, index):
+        """(H, W) uint8."""
+        rng = np.random.default_rng(index)
+        width, height = self._size_px
+        coarse = rng.integers(0, 256, (height // 8, width // 8), dtype=np.uint8)
+        return np.kron(coarse, np.ones((8, 8), dtype=np.uint8))
+
+
+@pytest.fixture(autouse=True)
+def _blocks(monkeypatch):
+    monkeypatch.setattr(stages, "picture_source", lambda options, seed: Blocks(options.count + options.held_out))
+
+
+def train(folder, options=OPTIONS, *, resume=False):
+    training = stages.Training(
+        ENCODER,
+        ARCHITECTURE,
+        options,
+        device=torch.device("cpu"),
+        folder=folder,
+        tracker=NullTracker(),
+        shown=False,
+        resume=resume,
+    )
+    return training.run()
+
+
+def final_state(folder):
+    return torch.load(folder / "resume.ckpt", map_location="cpu", weights_only=True)
+
+
+def assert_same_training(one, other):
+    first, second = final_state(one), final_state(other)
+    assert first["iteration"] == second["iteration"] == OPTIONS.iterations
+    assert first["net"].keys() == second["net"].keys()
+    for name, value in first["net"].items():
+        assert torch.equal(value, second["net"][name]), name
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A training from nothing to its end."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stages, "picture_source", lambda options, seed: Blocks(options.count + options.held_out))
+        return folder, train(folder)
+
+
+def test_training_leaves_weights_with_a_card_that_tells_of_it(whole):
+    folder, weights = whole
+    card = read_card(weights)
+    assert card["architecture"] == ARCHITECTURE
+    assert card["iteration"] in (4, 6) and card["iterations"] == 6
+    assert card["hours"] > 0.0
+    assert card["training"]["descriptor_loss"]["kind"] == "SparseTripletLoss"
+    assert card["labels"]["told"]["pictures"] == 6
+    assert card["labels"]["detector"]["training"]["iterations"] == 4
+    assert 0.0 <= card["validation"]["rep"] <= 1.0
+    assert {"shapes.csv", "joint.csv", "labels", "pictures"} <= {path.name for path in folder.iterdir()}
+    assert (folder / "joint.csv").read_text().splitlines()[-1].startswith("6,")
+    assert list((folder / "pictures").glob("joint-*.png"))
+    assert json.loads((folder / "labels" / "labels.json").read_text())["told"]["points_median"] > 0
+
+
+@pytest.mark.parametrize("at", [("shapes", 1), ("shapes", 3), ("joint", 1), ("joint", 5)], ids=str)
+def test_a_training_that_was_stopped_goes_on_to_the_same_weights(whole, tmp_path, monkeypatch, at):
+    stage, iteration = at
+    name = {"shapes": "ShapeBatches", "joint": "PairBatches"}[stage]
+    original = getattr(stages, name)
+
+    class Stopping(original):
+        """Stops like Ctrl-C at one iteration."""
+
+        def __call__(self, number):
+            if number == iteration:
+                raise KeyboardInterrupt
+            return super().__call__(number)
+
+    monkeypatch.setattr(stages, name, Stopping)
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path)
+    monkeypatch.setattr(stages, name, original)
+    train(tmp_path, resume=(tmp_path / "resume.ckpt").exists())
+    assert_same_training(whole[0], tmp_path)
+
+
+def test_labelling_goes_on_where_it_was_stopped(whole, tmp_path, monkeypatch):
+    monkeypatch.setattr("vioframe_superpoint.training.labelling.CHUNK", 2)
+    asked = []
+
+    class Stopping(Blocks):
+        """Stops like a kill within the second chunk."""
+
+        def picture(self, index):
+            asked.append(index)
+            if index == 3 and asked.count(3) == 1:
+                raise KeyboardInterrupt
+            return super().picture(index)
+
+    monkeypatch.setattr(stages, "picture_source", lambda options, seed: Stopping(options.count + options.held_out))
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path)
+    train(tmp_path, resume=True)
+    assert asked.count(0) == 1 and asked.count(2) == 2
+    assert_same_training(whole[0], tmp_path)
+
+
+def test_complete_labels_serve_another_training(whole, tmp_path, monkeypatch):
+    def refuse(*arguments):
+        raise AssertionError("labels were made again")
+
+    monkeypatch.setattr(stages, "picture_source", refuse)
+    weights = train(tmp_path, replace(OPTIONS, labels=str(whole[0] / "labels"), iterations=2, validate_every=2))
+    assert read_card(weights)["start"].startswith("detector")
+    assert not (tmp_path / "labels").exists()
+
+
+def test_no_labels_are_mixed_with_others(whole, tmp_path):
+    store = LabelStore(whole[0] / "labels")
+    about = {name: value for name, value in store.about().items() if name not in ("format", "told")}
+    store.begin(about)
+    with pytest.raises(DataError, match=r"other seed .*frontend\.training\.labels"):
+        store.begin({**about, "seed": 99})
+
+
+def test_a_session_ends_with_its_time_and_can_be_gone_on_with(whole, tmp_path):
+    hurried = replace(OPTIONS, max_minutes=1e-9)
+    assert train(tmp_path, hurried) is None
+    for _ in range(12):
+        if train(tmp_path, hurried, resume=True) and final_state(tmp_path)["iteration"] == OPTIONS.iterations:
+            break
+    assert_same_training(whole[0], tmp_path)
+
+
+def test_resume_file_of_something_else_is_refused(tmp_path):
+    (tmp_path / "resume.ckpt").write_bytes(b"nothing of the kind")
+    with pytest.raises(DataError, match="not a whole resume file of frontend=superpoint"):
+        train(tmp_path, resume=True)
+
+
+def test_damaged_labels_are_told(whole, tmp_path):
+    store = LabelStore(tmp_path)
+    store.begin({"seed": 0})
+    store.write(0, [np.zeros((16, 16), dtype=np.uint8)], [np.zeros((3, 2))])
+    (tmp_path / "points-0000.npz").write_bytes(b"PK")
+    with pytest.raises(DataError, match="chunk 0 of .* is damaged"):
+        store.read()
+
+
+def test_options_name_what_is_wrong():
+    with pytest.raises(ConfigError, match=r"frontend\.training\.validate_every=5 must be a multiple"):
+        replace(OPTIONS, validate_every=5)
+    with pytest.raises(ConfigError, match=r"frontend\.training\.schedule must be one of .*'linear'"):
+        replace(OPTIONS, schedule="linear")
+    with pytest.raises(ConfigError, match=r"pairs\.size_px must be .* multiples of 8"):
+        replace(PAIRS, size_px=[100, 48])
+    with pytest.raises(ConfigError, match=r"frontend\.training\.iterations must be positive"):
+        replace(OPTIONS, iterations=0)
+
+
+def test_classes_say_where_in_the_cell_a_point_lies():
+    rng = np.random.default_rng(0)
+    points = np.array([[0.0, 0.0], [15.4, 1.6], [7.0, 15.0], [np.nan, 1.0], [16.0, 3.0], [-1.0, 2.0]])
+    classes = cell_classes(points, (16, 16), rng)
+    assert classes.tolist() == [[0, 2 * 8 + 7], [7 * 8 + 7, 64]]
+
+
+def test_ties_in_a_cell_are_broken_either_way():
+    points = np.array([[1.0, 0.0], [2.0, 0.0]])
+    seen = {int(cell_classes(points, (8, 8), np.random.default_rng(seed))[0, 0]) for seed in range(20)}
+    assert seen == {1, 2}
+
+
+def test_a_cell_is_whole_where_all_its_pixels_are():
+    mask = np.ones((16, 24), dtype=bool)
+    mask[9, 20] = False
+    assert whole_cells(mask).tolist() == [[True, True, True], [True, True, False]]
+
+
+def test_points_of_a_pair_correspond_and_views_show_the_same():
+    rng = np.random.default_rng(5)
+    x, y = np.meshgrid(np.arange(160), np.arange(120))
+    # A smooth picture, so that an interpolated value is near the true one.
+    picture = np.rint(127 + 60 * np.sin(x / 9.0) + 60 * np.cos(y / 7.0)).astype(np.uint8)
+    labels = rng.uniform(5, [155, 115], (40, 2))
+    for seed in range(8):
+        pair = make_pair(picture, labels, np.random.default_rng(seed), PAIRS)
+        matched = pair["matched"]
+        assert matched.sum() > 8
+        first, second = pair["points"][:, matched]
+        np.testing.assert_allclose(warp_points(first, pair["H"].astype(np.float64)), second, atol=2e-2)
+        values = [
+            pair["images"][view][np.rint(p[:, 1]).astype(int), np.rint(p[:, 0]).astype(int)].astype(float)
+            for view, p in enumerate((first, second))
+        ]
+        assert np.abs(values[0] - values[1]).mean() < 12
+        assert np.corrcoef(*values)[0, 1] > 0.9
+
+
+def test_labels_of_a_pair_are_where_the_picture_shows_them():
+    # One white pixel, labelled, on black: wherever the class is, it is bright.
+    for seed in range(6):
+        picture = np.zeros((120, 160), dtype=np.uint8)
+        labels = np.random.default_rng(seed).integers(30, 90, (4, 2)).astype(float)
+        for x, y in labels.astype(int):
+            picture[y - 1 : y + 2, x - 1 : x + 2] = 255
+        pair = make_pair(picture, labels, np.random.default_rng(seed), PAIRS)
+        for view in range(2):
+            for row, column in np.argwhere(pair["classes"][view] < 64):
+                place = int(pair["classes"][view][row, column])
+                assert pair["images"][view][row * 8 + place // 8, column * 8 + place % 8] > 60
+
+
+def test_pairs_are_a_pure_function_of_the_generator():
+    picture = Blocks(1, (160, 120)).picture(0)
+    labels = np.array([[40.0, 40.0], [80.0, 60.0]])
+    lit = replace(PAIRS, lighting=LightingOptions())
+    one, other = (make_pair(picture, labels, np.random.default_rng(9), lit) for _ in range(2))
+    for name in one:
+        np.testing.assert_array_equal(one[name], other[name])
+
+
+def test_adaptation_of_one_view_is_the_detector():
+    net = make_net(ENCODER).eval()
+    picture = Blocks(1, (64, 48)).picture(0)
+    options = replace(OPTIONS.adaptation, homographies=1, border_px=0)
+    heat = adapted_heat(net, picture, np.random.default_rng(0), options)
+    from vioframe_superpoint.training.adaptation import heat_of
+
+    np.testing.assert_allclose(heat, heat_of(net, picture[None])[0], atol=1e-6)
+
+
+def test_adaptation_brings_answers_back_to_where_they_are(monkeypatch):
+    # A detector that answers with the brightness itself: its mean over views is the picture, blurred by interpolation.
+    monkeypatch.setattr(
+        "vioframe_superpoint.training.adaptation.heat_of", lambda net, pictures, precision: pictures / 255.0
+    )
+    picture = np.zeros((96, 128), dtype=np.uint8)
+    true = np.array([[40, 30], [90, 60], [64, 48]])
+    for x, y in true:
+        picture[y - 2 : y + 3, x - 2 : x + 3] = 255
+    options = replace(OPTIONS.adaptation, homographies=30, threshold=0.3)
+    heat = adapted_heat(None, picture, np.random.default_rng(1), options)
+    points = points_of(heat, options)
+    assert len(points) == 3
+    apart = np.linalg.norm(points[:, None] - true[None], axis=2)
+    assert apart.min(axis=0).max() < 0.3
+
+
+def test_refined_points_follow_the_centre_of_heat():
+    x, y = np.meshgrid(np.arange(20), np.arange(20))
+    heat = np.exp(-((x - 8.3) ** 2 + (y - 11.2) ** 2) / 2.0)
+    placed = refined(heat, np.array([[8, 11]]))[0]
+    assert abs(placed[0] - 8.3) < 0.1 and abs(placed[1] - 11.2) < 0.1
+
+
+def test_rates_rise_hold_and_fall():
+    for schedule, last in (("constant", 1.0), ("cosine", 0.0), ("trapezoid", 0.0)):
+        options = RateOptions(iterations=1000, learning_rate=1.0, schedule=schedule, warmup=10, weight_decay=0.0)
+        factor = rate_factor(options)
+        assert factor(0) < 0.1 and factor(10) == pytest.approx(1.0)
+        assert factor(1000) == pytest.approx(last, abs=1e-6)
+    assert factor(700) == 1.0 and factor(900) == pytest.approx(0.5)
+
+
+def test_front_end_has_a_training_of_its_own():
+    from vioframe_superpoint import SuperPointFrontend
+
+    front = SuperPointFrontend(encoder=ENCODER, weights=None, training=OPTIONS)
+    assert isinstance(front, TrainsItself)
+    with pytest.raises(ConfigError, match=r"frontend\.training is null"):
+        SuperPointFrontend(encoder=ENCODER, weights=None).train_itself(
+            Path("nowhere"), NullTracker(), shown=False, resume=False
+        )
+
+
+def test_time_is_that_of_all_sessions(whole):
+    state = final_state(whole[0])
+    assert 0.0 < state["seconds"] < time.monotonic()
