@@ -21,6 +21,8 @@ _SIGHT_UNIT = 0.02
 _HIDDEN = 64
 # In squared units of the output, logarithms.
 _LARGEST_LOG_VARIANCE = 12.0
+# ln of a variance that an output of 1 is worth.
+_DOUBT_GAIN = 4.0
 # rad/s that rotations shown by images are always off by, before anything is learned of it.
 _LASTING_SIGMA = 0.005
 # ln of a variance that one unit of a parameter is worth: an optimiser's steps are of the size of weights.
@@ -71,6 +73,8 @@ class GyroCheck(nn.Module):
         self.sight = nn.Linear(_HIDDEN, 3)
         self.doubt = nn.Linear(_HIDDEN, 3)
         self.lasting = nn.Parameter(torch.zeros(3))
+        # A tenth of what there is to see.
+        nn.init.constant_(self.doubt.bias, -4.6 / _DOUBT_GAIN)
         self._bias_variance = (bias_sigma * USUAL_S) ** 2
         self._memory = memory
 
@@ -91,7 +95,8 @@ class GyroCheck(nn.Module):
         hidden = self.hidden(embedding)
         numbers = self.sight(hidden).float()
         # What is learned of errors must not bend what is learned of rotations.
-        limited = self.doubt(hidden.detach()).float().clamp(-_LARGEST_LOG_VARIANCE, _LARGEST_LOG_VARIANCE)
+        limited = _DOUBT_GAIN * self.doubt(hidden.detach()).float()
+        limited = limited.clamp(-_LARGEST_LOG_VARIANCE, _LARGEST_LOG_VARIANCE)
         return Sight(_SIGHT_UNIT * numbers, limited + 2.0 * math.log(_SIGHT_UNIT))
 
     def forward(
