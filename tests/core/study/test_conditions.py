@@ -125,7 +125,7 @@ def test_page_and_numbers_hold_conditions_recordings_and_comparisons(tmp_path):
     told = summary({"vins_mono": CALM, "vins_orb": BETTER}, completion=failed)
     write_study(told, tmp_path, "a: b")
     page = (tmp_path / "study.html").read_text(encoding="utf-8")
-    assert "Beside vins_mono" in page and "dataset.degradations.low_light=0.8" in page and "1 of 6 failed" in page
+    assert "Beside vins_mono" in page and "dataset.degradations.low_light=0.9" in page and "1 of 6 failed" in page
     document = json.loads((tmp_path / "study.json").read_text())
     found = {(entry["metric"], entry["at"]): entry for entry in document["comparisons"]}
     assert found["ate_se3_m", "blur_weak"]["of_pairs"]["value"] == pytest.approx(0.8)
