@@ -73,8 +73,6 @@ class GyroCheck(nn.Module):
         self.sight = nn.Linear(_HIDDEN, 3)
         self.doubt = nn.Linear(_HIDDEN, 3)
         self.lasting = nn.Parameter(torch.zeros(3))
-        # A tenth of what there is to see.
-        nn.init.constant_(self.doubt.bias, -4.6 / _DOUBT_GAIN)
         self._bias_variance = (bias_sigma * USUAL_S) ** 2
         self._memory = memory
 
