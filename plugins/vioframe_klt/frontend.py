@@ -12,12 +12,12 @@ from vioframe.errors import ConfigError, DataError, StateError
 from vioframe.geometry import camera as projection
 from vioframe.interfaces import IMAGES, STEREO, STEREO_TRACKS, TRACKS, Frontend
 from vioframe.types import Camera, Frame, Image, SensorRig, Tracks, VisualFeatures
+from vioframe.vision.anchors import Anchors
 from vioframe.vision.corners import CornerDetector
 from vioframe.vision.gray import gray_image, normalise_exposure
 from vioframe.vision.outliers import epipolar_inliers
 from vioframe.vision.spread import crowded
 from vioframe.vision.two_cameras import TwoCameras
-from vioframe.vision.anchors import Anchors
 from vioframe_klt.points import Points, inside
 from vioframe_klt.search import Search
 from vioframe_klt.stereo import StereoMatcher
@@ -188,6 +188,7 @@ class KltFrontend(Frontend):
         self._next_id = 0
         self._images = 0
         self._lost_all = 0
+        self._lost_told = False
         self._since_corners = 0
         self._after_corners = 0
         self._before: Image | None = None
@@ -213,9 +214,14 @@ class KltFrontend(Frontend):
         right = self._prepare(frame, 1, self._matcher.cameras.right) if self._matcher else None
         if self._before is not None and len(self._points):
             self._follow(self._before, gray, R_prev_cur, self._camera)
-            if len(self._points) == 0:
+            if len(self._points):
+                self._lost_told = False
+            else:
                 self._lost_all += 1
-                log.warning("KLT: all points were lost at stamp %d ns", frame.stamp_ns)
+                # In the dark it may go on for minutes, image after image.
+                if not self._lost_told:
+                    log.warning("KLT: all points were lost at stamp %d ns", frame.stamp_ns)
+                self._lost_told = True
         self._since_corners += 1
         count = len(self._points)
         worn = count < _MIN_KEPT * self._after_corners

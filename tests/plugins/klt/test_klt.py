@@ -332,3 +332,15 @@ def test_nothing_moves_while_the_vehicle_stands():
     # All points share half a pixel: the vehicle turns by a milliradian; what they do not share is noise.
     assert np.linalg.norm(np.median(moved, axis=0)) < 0.8
     assert np.median(np.linalg.norm(moved - np.median(moved, axis=0), axis=-1)) < 0.25
+
+
+def test_losing_everything_image_after_image_is_said_once(caplog):
+    """Images that have nothing in common, as noise in the dark: all points are lost in each of them."""
+    frontend = KltFrontend()
+    frontend.setup(make_rig())
+    rng = np.random.default_rng(0)
+    for index in range(6):
+        noise = rng.integers(0, 256, SIZE[::-1]).astype(np.uint8)
+        frontend.process(frame(cv2.GaussianBlur(noise, (0, 0), 1.5), index))
+    assert frontend.counters()["lost all tracks"] >= 3
+    assert len([record for record in caplog.records if "all points were lost" in record.message]) == 1
