@@ -90,8 +90,10 @@ class SuperPointExtractor:
         self._half = half
         self._batch = batch
         self._slot = slot
-        self._shipped = _FOLDER / f"{encoder.name}.safetensors" if weights == SHIPPED else None
-        found = str(self._shipped) if self._shipped is not None else weights
+        # A training begins without them; whoever wants to use them is told.
+        shipped = _FOLDER / f"{encoder.name}.safetensors"
+        self._lacks_shipped = weights == SHIPPED and not shipped.is_file()
+        found = weights if weights != SHIPPED else None if self._lacks_shipped else str(shipped)
         self._holder = NetHolder(self, slot, "superpoint", self._make_net, found, device)
         self._inference: InferenceNet | None = None
 
@@ -103,7 +105,6 @@ class SuperPointExtractor:
             ConfigError: there is no such file of weights.
             DataError: the file is of another architecture, or damaged.
         """
-        self._check_shipped()
         return self._holder.net
 
     @property
@@ -134,7 +135,12 @@ class SuperPointExtractor:
         from vioframe_superpoint.net.inference import InferenceNet
         from vioframe_superpoint.net.superpoint import SuperPointNet
 
-        self._check_shipped()
+        if self._lacks_shipped:
+            raise ConfigError(
+                f"{self._slot}.weights={SHIPPED}: no weights of encoder={self._encoder.name} came with this "
+                f"installation; give {self._slot}.weights=FILE, or train some with task=train frontend=superpoint "
+                f"encoder={self._encoder.name} ({self._slot}.weights=null runs a net of random weights)"
+            )
         net = self._holder.prepare()
         if isinstance(net, SuperPointNet):
             self._inference = InferenceNet(net, half=self._half and self._holder.device().type == "cuda")
@@ -261,14 +267,6 @@ class SuperPointExtractor:
         shift = np.stack([window.sum(axis=1) @ offset, window.sum(axis=2) @ offset], axis=-1) / total[:, None]
         refined: Array = pixels + shift
         return refined
-
-    def _check_shipped(self) -> None:
-        if self._shipped is not None and not self._shipped.is_file():
-            raise ConfigError(
-                f"{self._slot}.weights={SHIPPED}: no weights of encoder={self._encoder.name} came with this "
-                f"installation; give {self._slot}.weights=FILE, or train some with task=train frontend=superpoint "
-                f"encoder={self._encoder.name} ({self._slot}.weights=null runs a net of random weights)"
-            )
 
     def _make_net(self) -> "nn.Module":
         from vioframe_superpoint.net.superpoint import make_net
