@@ -87,7 +87,7 @@ def _train_themselves(config: DictConfig, choices: Mapping[str, str]) -> dict[st
     parts = build_pipeline(config, choices).parts()
     chosen = OmegaConf.select(config, "trainer.train")
     wanted = {slot: part for slot, part in parts.items() if chosen is None or slot in chosen}
-    own = {slot: part for slot, part in wanted.items() if isinstance(part, TrainsItself)}
+    own: dict[str, TrainsItself] = {slot: part for slot, part in wanted.items() if isinstance(part, TrainsItself)}
     others = [slot for slot, part in wanted.items() if isinstance(part, Trainable) and slot not in own]
     if own and others:
         first, second = next(iter(own)), others[0]

@@ -31,7 +31,7 @@ def adapted_heat(
     """
     height, width = picture.shape
     size = (width, height)
-    homographies = [np.eye(3)]
+    homographies: list[Array] = [np.eye(3)]
     homographies += [sample_homography(size, rng, options.ranges) for _ in range(options.homographies - 1)]
     total = np.zeros((height, width))
     views = np.zeros((height, width))

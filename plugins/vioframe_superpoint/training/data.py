@@ -8,13 +8,12 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from vioframe.checks import Array
 from vioframe_superpoint.synthetic import SyntheticShapes
 from vioframe_superpoint.training.labels import LabelledPictures, cell_classes
 from vioframe_superpoint.training.options import PairOptions, ShapesOptions
 from vioframe_superpoint.training.pairs import make_pair, stack_pairs
 
-MakeBatch = Callable[[int], Mapping[str, Array]]
+MakeBatch = Callable[[int], Mapping[str, np.ndarray]]
 """Iteration → arrays by name."""
 
 # What tells the random numbers of one purpose from those of another with the same seed.
@@ -49,7 +48,7 @@ class ShapeBatches:
         self._batch_size = options.batch_size
         self._seed = seed
 
-    def __call__(self, iteration: int) -> dict[str, Array]:
+    def __call__(self, iteration: int) -> dict[str, np.ndarray]:
         """The batch of an iteration."""
         images, classes = [], []
         for index in range(iteration * self._batch_size, (iteration + 1) * self._batch_size):
@@ -74,9 +73,9 @@ class PairBatches:
         self._options = options
         self._batch_size = batch_size
         self._seed = seed
-        self._deck: tuple[int, Array] = (-1, np.zeros(0, dtype=np.int64))
+        self._deck: tuple[int, np.ndarray] = (-1, np.zeros(0, dtype=np.int64))
 
-    def __call__(self, iteration: int) -> Mapping[str, Array]:
+    def __call__(self, iteration: int) -> Mapping[str, np.ndarray]:
         """The batch of an iteration."""
         pairs = []
         for place in range(iteration * self._batch_size, (iteration + 1) * self._batch_size):

@@ -66,7 +66,8 @@ def draw_pairs(path: Path, shown: Sequence[tuple[PicturePair, Seen]]) -> None:
 
 def _enlarge(picture: Image, factor: int) -> Image:
     large = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_LINEAR)
-    return cv2.cvtColor(large, cv2.COLOR_GRAY2BGR)  # type: ignore[return-value]
+    coloured: Image = cv2.cvtColor(large, cv2.COLOR_GRAY2BGR)
+    return coloured
 
 
 def _place(point: Array, factor: int) -> tuple[int, int]:

@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from vioframe.checks import Array
+from vioframe.checks import Array, Mask
 from vioframe.errors import DataError
 from vioframe.types import Image
 
@@ -171,7 +172,7 @@ class LabelStore:
         return self.folder / f"points-{chunk:04d}.npz"
 
 
-def cell_classes(points: Array, size_px: tuple[int, int], rng: np.random.Generator) -> Array:
+def cell_classes(points: Array, size_px: tuple[int, int], rng: np.random.Generator) -> NDArray[np.int64]:
     """Classes (h, w) int64 of the cells of a picture: where in it a point lies, or 64.
 
     Of several points in a cell one is taken at random.
@@ -193,10 +194,10 @@ def cell_classes(points: Array, size_px: tuple[int, int], rng: np.random.Generat
     return classes
 
 
-def whole_cells(mask: Array) -> Array:
+def whole_cells(mask: Mask) -> Mask:
     """Cells (h, w) bool all of whose pixels are in ``mask`` (8h, 8w)."""
     height, width = mask.shape
-    cells: Array = mask.reshape(height // 8, 8, width // 8, 8).all(axis=(1, 3))
+    cells: Mask = np.all(mask.reshape(height // 8, 8, width // 8, 8), axis=(1, 3))
     return cells
 
 

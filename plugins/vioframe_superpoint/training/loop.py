@@ -121,7 +121,7 @@ class Loop:
     def __init__(self, net: nn.Module, stage: Stage, session: Session) -> None:
         self.progress = Progress()
         # Other numbers would come out of other layouts in the last bits; this one is the fastest everywhere.
-        self._net = net.to(memory_format=torch.channels_last)
+        self._net = _laid_out(net)
         self._stage = stage
         self._session = session
         self._optimizer = _optimizer(net, stage.rate)
@@ -268,6 +268,14 @@ def read_resume(path: Path) -> dict[str, Any]:
             f"trainer.resume={path} is not a whole resume file of frontend=superpoint: begin anew"
         ) from error
     return dict(content)
+
+
+def _laid_out(net: nn.Module) -> nn.Module:
+    """The net with its weights as convolutions read them fastest."""
+    for parameter in net.parameters():
+        if parameter.ndim == 4:
+            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+    return net
 
 
 def _optimizer(net: nn.Module, rate: RateOptions) -> torch.optim.Optimizer:

@@ -115,12 +115,14 @@ class ShapesOptions:
         batch_size: pictures in a step.
         size_px: (width, height) of a picture.
         learning_rate: at its highest.
+        corner_weight: of a cell with a corner beside one without; what comes out is as if it were 1.
     """
 
     iterations: int
     batch_size: int
     size_px: Sequence[int]
     learning_rate: float
+    corner_weight: float
 
     def __post_init__(self) -> None:
         check_positive(
@@ -128,6 +130,7 @@ class ShapesOptions:
             iterations=self.iterations,
             batch_size=self.batch_size,
             learning_rate=self.learning_rate,
+            corner_weight=self.corner_weight,
         )
         _check_size(f"{_KEY}.shapes.size_px", self.size_px)
 

@@ -4,8 +4,9 @@ from collections.abc import Mapping
 from typing import TypedDict
 
 import numpy as np
+from numpy.typing import NDArray
 
-from vioframe.checks import Array
+from vioframe.checks import Array, Mask
 from vioframe.pictures import change_light, sample_homography, valid_mask, warp_picture, warp_points
 from vioframe.types import Image
 from vioframe_superpoint.training.labels import cell_classes, whole_cells
@@ -26,13 +27,13 @@ class Pair(TypedDict):
     which of these are there.
     """
 
-    images: Array
-    classes: Array
-    whole: Array
-    overlap: Array
-    H: Array
-    points: Array
-    matched: Array
+    images: NDArray[np.uint8]
+    classes: NDArray[np.int64]
+    whole: Mask
+    overlap: Mask
+    H: NDArray[np.float32]
+    points: NDArray[np.float32]
+    matched: Mask
 
 
 def make_pair(picture: Image, labels: Array, rng: np.random.Generator, options: PairOptions) -> Pair:
@@ -94,12 +95,12 @@ def _crop(
 def _matches(
     labels: Array,
     views: tuple[Array, Array],
-    masks: list[Array],
+    masks: list[Mask],
     H: Array,
     size: tuple[int, int],
     rng: np.random.Generator,
     options: PairOptions,
-) -> tuple[Array, Array]:
+) -> tuple[NDArray[np.float32], Mask]:
     """Points (2, N, 2) px that both views show, labels first, and which of them are there (N,)."""
     chosen = [warp_points(labels, view) for view in views]
     count = options.matches
@@ -116,17 +117,17 @@ def _matches(
     return points, np.arange(count) < len(first)
 
 
-def _inside(points: Array, mask: Array) -> Array:
+def _inside(points: Array, mask: Mask) -> Mask:
     """Which points (P, 2) px lie on a true pixel of the mask (H, W); NaN lies nowhere."""
     with np.errstate(invalid="ignore"):
         near = np.rint(np.nan_to_num(points, nan=-1e6))
     height, width = mask.shape
-    inside: Array = (near >= 0).all(axis=1) & (near[:, 0] < width) & (near[:, 1] < height)
+    inside: Mask = (near >= 0).all(axis=1) & (near[:, 0] < width) & (near[:, 1] < height)
     places = near[inside].astype(np.int64)
     inside[inside] = mask[places[:, 1], places[:, 0]]
     return inside
 
 
-def stack_pairs(pairs: list[Pair]) -> Mapping[str, Array]:
+def stack_pairs(pairs: list[Pair]) -> Mapping[str, np.ndarray]:
     """A batch: each field with a leading axis."""
     return {name: np.stack([pair[name] for pair in pairs]) for name in Pair.__annotations__}  # type: ignore[literal-required]

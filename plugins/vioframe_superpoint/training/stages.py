@@ -5,9 +5,7 @@ wrote it.
 """
 
 import logging
-import os
 import platform
-import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,7 +28,7 @@ from vioframe_superpoint.training.options import TrainingOptions, plain_values
 from vioframe_superpoint.training.precision import resolve_precision
 from vioframe_superpoint.training.schedule import RateOptions
 from vioframe_superpoint.training.sources import picture_source
-from vioframe_superpoint.training.steps import JointLoss, shapes_loss
+from vioframe_superpoint.training.steps import JointLoss, ShapesLoss
 from vioframe_superpoint.training.validation import PairValidation, ShapesValidation, validation_pairs
 
 log = logging.getLogger(__name__)
@@ -154,10 +152,11 @@ class Training:
         options = self._options.shapes
         validation = ShapesValidation(net.net, options)
         best = self._folder / "weights" / DETECTOR_FILE
+        loss = ShapesLoss(options.corner_weight)
         done = self._fit(
             SHAPES,
             net,
-            shapes_loss,
+            loss,
             ShapeBatches(options, self._options.seed),
             RateOptions(
                 iterations=options.iterations,
@@ -172,10 +171,9 @@ class Training:
             rate_key="frontend.training.shapes.learning_rate",
         )
         if done:
-            self._store.folder.mkdir(parents=True, exist_ok=True)
-            for path in (best.with_suffix(".json"), best):
-                shutil.copyfile(path, self._store.folder / f"{path.name}.partial")
-                os.replace(self._store.folder / f"{path.name}.partial", self._store.folder / path.name)
+            load_weights(best, net, "the first stage")
+            loss.take_back(net.net)
+            save_weights(self._store.folder / DETECTOR_FILE, net, read_card(best))
         return done
 
     def _train_jointly(self) -> Path | None:

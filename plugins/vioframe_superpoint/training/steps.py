@@ -1,25 +1,44 @@
 """The loss of a step of either stage of training."""
 
+import math
 from collections.abc import Mapping
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
-from vioframe_superpoint.training.losses import descriptor_loss, detector_loss
+from vioframe_superpoint.net.superpoint import SuperPointNet
+from vioframe_superpoint.training.losses import DUSTBIN, descriptor_loss, detector_loss
 from vioframe_superpoint.training.options import DescriptorLoss
 
 
-def shapes_loss(net: nn.Module, batch: Mapping[str, Tensor], iteration: int) -> dict[str, Tensor]:
+class ShapesLoss:
     """Of the first stage: the detector's alone.
 
+    Few cells of a drawing have a corner, and a net learns for long that none has. So those that have one weigh more; to
+    a net that has learned this way corners seem more likely than they are, by just that factor, which
+    :meth:`take_back` undoes.
+
     Args:
-        net: SuperPoint's.
-        batch: ``images`` (B, H, W) uint8 and ``classes`` (B, h, w).
-        iteration: does not matter.
+        corner_weight: of a cell with a corner.
     """
-    logits = net.detector(net.encoder(as_float(batch["images"])))  # type: ignore[operator]
-    classes = batch["classes"]
-    return {"loss": detector_loss(logits, classes, torch.ones_like(classes, dtype=torch.bool))}
+
+    def __init__(self, corner_weight: float) -> None:
+        self._weight = corner_weight
+
+    def __call__(self, net: nn.Module, batch: Mapping[str, Tensor], iteration: int) -> dict[str, Tensor]:
+        """The loss of ``images`` (B, H, W) uint8 with ``classes`` (B, h, w)."""
+        logits = net.detector(net.encoder(as_float(batch["images"])))  # type: ignore[operator]
+        weights = torch.full((DUSTBIN + 1,), self._weight, device=logits.device)
+        weights[DUSTBIN] = 1.0
+        return {"loss": F.cross_entropy(logits.float(), batch["classes"], weight=weights)}
+
+    def take_back(self, net: SuperPointNet) -> None:
+        """Make the answers of a net those of one that learned with a weight of 1."""
+        bias = net.detector.last.bias
+        if bias is not None:
+            with torch.no_grad():
+                bias[:DUSTBIN] -= math.log(self._weight)
 
 
 class JointLoss:

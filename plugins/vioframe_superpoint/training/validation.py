@@ -10,7 +10,7 @@ from vioframe.checks import Array
 from vioframe.features.protocol import FeatureProtocol
 from vioframe.features.scoring import PairScores, score_pair
 from vioframe.pictures import HomographyOptions, LightingOptions, change_light, sample_homography, warp_picture
-from vioframe.pictures.pairs import PicturePair
+from vioframe.pictures.pairs import SPLITS, PicturePair
 from vioframe.types import Image
 from vioframe.vision.keypoints import Keypoints
 from vioframe_superpoint.net.keypoints import heatmap, remove_border, sample_descriptors, suppress
@@ -67,7 +67,7 @@ def validation_pairs(pictures: Sequence[Image], lighting: LightingOptions, seed:
         picture = np.array(picture)
         rng = np.random.default_rng([seed, _VALIDATION, number])
         H = sample_homography((picture.shape[1], picture.shape[0]), rng, _VIEWS)
-        for split, view in (("illumination", np.eye(3)), ("viewpoint", H)):
+        for split, view in zip(SPLITS, (np.eye(3), H), strict=True):
             first, second = picture, warp_picture(picture, view)
             if split == "illumination":
                 first, second = (change_light(each, rng, lighting) for each in (first, second))
@@ -109,7 +109,7 @@ class PairValidation:
         extractor = NetExtractor(self._net)
         seen = [score_pair("superpoint", extractor, pair, self._protocol).scores for pair in self._pairs]
         figures: dict[str, float] = {}
-        for split in ("illumination", "viewpoint"):
+        for split in SPLITS:
             figures |= {
                 f"{split}/{name}": value for name, value in _means([s for s in seen if s.split == split]).items()
             }
@@ -127,7 +127,7 @@ class PairValidation:
         from vioframe_superpoint.training.drawing import draw_pairs
 
         extractor = NetExtractor(self._net)
-        shown = [next(pair for pair in self._pairs if pair.split == split) for split in ("illumination", "viewpoint")]
+        shown = [next(pair for pair in self._pairs if pair.split == split) for split in SPLITS]
         draw_pairs(path, [(pair, score_pair("superpoint", extractor, pair, self._protocol)) for pair in shown])
 
 

@@ -30,6 +30,7 @@ from vioframe_superpoint.training.adaptation import adapted_heat, points_of, ref
 from vioframe_superpoint.training.labels import LabelStore, cell_classes, whole_cells  # noqa: E402
 from vioframe_superpoint.training.pairs import make_pair  # noqa: E402
 from vioframe_superpoint.training.schedule import RateOptions, rate_factor  # noqa: E402
+from vioframe_superpoint.training.steps import ShapesLoss  # noqa: E402
 
 STILL = LightingOptions(**{name: 0.0 for name in LightingOptions.__dataclass_fields__})
 ENCODER = Encoder(name="mobilenetv2", width=0.25)
@@ -55,7 +56,7 @@ OPTIONS = TrainingOptions(
     detector=None,
     descriptor_loss=SparseTripletLoss(weight=1.2, margin=1.0, negatives=4, radius_px=8.0, both_ways=True),
     pictures=PictureOptions(count=4, size_px=[96, 64], folder=None, places=0.0, held_out=2),
-    shapes=ShapesOptions(iterations=4, batch_size=2, size_px=[64, 48], learning_rate=1e-3),
+    shapes=ShapesOptions(iterations=4, batch_size=2, size_px=[64, 48], learning_rate=1e-3, corner_weight=8.0),
     adaptation=AdaptationOptions(
         homographies=4,
         threshold=0.001,
@@ -302,6 +303,18 @@ def test_pairs_are_a_pure_function_of_the_generator():
         np.testing.assert_array_equal(one[name], other[name])
 
 
+def test_what_corners_weigh_is_taken_back():
+    # To a net that learned with a weight w a share p of corners looks like w p / (w p + 1 - p).
+    net = make_net(ENCODER).eval()
+    images = torch.from_numpy(Blocks(1, (64, 48)).picture(0)[None, None]).float() / 255.0
+    with torch.no_grad():
+        biased = net(images)[0].softmax(dim=1)[:, -1]
+        ShapesLoss(8.0).take_back(net)
+        true = net(images)[0].softmax(dim=1)[:, -1]
+    corner = 1.0 - true
+    torch.testing.assert_close(1.0 - biased, 8.0 * corner / (8.0 * corner + true))
+
+
 def test_adaptation_of_one_view_is_the_detector():
     net = make_net(ENCODER).eval()
     picture = Blocks(1, (64, 48)).picture(0)
@@ -317,10 +330,10 @@ def test_adaptation_brings_answers_back_to_where_they_are(monkeypatch):
     monkeypatch.setattr(
         "vioframe_superpoint.training.adaptation.heat_of", lambda net, pictures, precision: pictures / 255.0
     )
-    picture = np.zeros((96, 128), dtype=np.uint8)
+    x, y = np.meshgrid(np.arange(128), np.arange(96))
     true = np.array([[40, 30], [90, 60], [64, 48]])
-    for x, y in true:
-        picture[y - 2 : y + 3, x - 2 : x + 3] = 255
+    spots = sum(np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / 4.5) for at in true)
+    picture = np.rint(255 * spots).astype(np.uint8)
     options = replace(OPTIONS.adaptation, homographies=30, threshold=0.3)
     heat = adapted_heat(None, picture, np.random.default_rng(1), options)
     points = points_of(heat, options)
