@@ -3,7 +3,8 @@
 The rotation that an embedding shows is far coarser than a gyro's over one pair, but most of what it is off by changes
 from pair to pair: its differences from the gyro are filtered, axis by axis, into what they have in common. That is the
 gyro's bias and what images are always off by themselves, and nothing in a recording tells one from the other: it is
-shared out by how large each is known to be, and the doubt that remains never goes away.
+shared out by how large each is known to be, and the doubt that remains never goes away. What changes from pair to pair
+is not white either: pairs in a row count for less than as many pairs apart.
 """
 
 import math
@@ -24,7 +25,9 @@ _LARGEST_LOG_VARIANCE = 12.0
 # ln of a variance that an output of 1 is worth.
 _DOUBT_GAIN = 4.0
 # rad/s that rotations shown by images are always off by, before anything is learned of it.
-_LASTING_SIGMA = 0.005
+_LASTING_SIGMA = 0.002
+# Pairs in a row that are worth one, likewise.
+_ALIKE = 20.0
 # ln of a variance that one unit of a parameter is worth: an optimiser's steps are of the size of weights.
 _LASTING_GAIN = 100.0
 
@@ -73,6 +76,7 @@ class GyroCheck(nn.Module):
         self.sight = nn.Linear(_HIDDEN, 3)
         self.doubt = nn.Linear(_HIDDEN, 3)
         self.lasting = nn.Parameter(torch.zeros(3))
+        self.alike = nn.Parameter(torch.zeros(3))
         self._bias_variance = (bias_sigma * USUAL_S) ** 2
         self._memory = memory
 
@@ -82,6 +86,11 @@ class GyroCheck(nn.Module):
         # Within a factor of 50 either way of where it starts.
         moved = (_LASTING_GAIN * self.lasting).clamp(-8.0, 8.0)
         return torch.exp(moved + 2.0 * math.log(_LASTING_SIGMA * USUAL_S))
+
+    @property
+    def pairs_alike(self) -> Tensor:
+        """(3,) pairs in a row whose rotations are off by the same, so that they are worth one."""
+        return torch.exp((_LASTING_GAIN * self.alike).clamp(-4.0, 4.0) + math.log(_ALIKE))
 
     def begin(self, like: Tensor, sequences: int) -> Bias:
         """What is known before anything was seen."""
@@ -112,7 +121,7 @@ class GyroCheck(nn.Module):
         usual = (duration_s / USUAL_S)[..., None].clamp_min(1e-3)
         lacking = log_so3(product(turns.transpose(-1, -2), exp_so3(sight.vector))) / usual
         # How far sight is to be believed is learned from its errors, not from what it does to the bias.
-        noise = sight.log_variances.detach().exp() / usual**2
+        noise = self.pairs_alike * sight.log_variances.detach().exp() / usual**2
         lasting = self.lasting_variance
         at_first = self._bias_variance + lasting
         # The gyro's share of what they differ by, and the variance of that share when the difference is known.

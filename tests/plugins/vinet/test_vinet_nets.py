@@ -86,7 +86,8 @@ def test_bias_of_the_gyro_is_what_least_squares_make_of_it():
     for axis in range(3):
         heard = checked[0]
         bias, lasting = (0.05 * 0.1) ** 2, check.lasting_variance[axis].item()
-        covariance = torch.full((5, 5), bias + lasting) + torch.diag(noise[0, heard, axis])
+        alike = check.pairs_alike[axis].item()
+        covariance = torch.full((5, 5), bias + lasting) + torch.diag(alike * noise[0, heard, axis])
         gain = torch.linalg.solve(covariance, torch.full((5,), bias))
         assert found.correction[0, -1, axis].item() == pytest.approx((gain @ said[0, heard, axis]).item(), rel=1e-3)
         left = (bias - gain.sum() * bias).item() / 0.1**2
