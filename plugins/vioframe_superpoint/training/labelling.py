@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from vioframe.pictures import PictureSource
+from vioframe_superpoint.net.inference import fold
 from vioframe_superpoint.net.superpoint import SuperPointNet
 from vioframe_superpoint.training.adaptation import adapted_heat, points_of
 from vioframe_superpoint.training.bar import Bar
 from vioframe_superpoint.training.labels import LabelStore
 from vioframe_superpoint.training.options import AdaptationOptions
+from vioframe_superpoint.training.steps import laid_out
 
 log = logging.getLogger(__name__)
 
@@ -56,7 +58,7 @@ def label_pictures(
     total = len(source)
     bar = Bar("labels", total, "pictures") if shown else None
     began, made = time.monotonic(), 0
-    net.eval()
+    folded = laid_out(fold(net))
     try:
         for chunk, first in enumerate(range(0, total, CHUNK)):
             if store.has(chunk):
@@ -67,7 +69,7 @@ def label_pictures(
             pictures, points = [], []
             for index in range(first, min(first + CHUNK, total)):
                 picture = source.picture(index)
-                heat = adapted_heat(net, picture, np.random.default_rng([seed, _LABELS, index]), options, precision)
+                heat = adapted_heat(folded, picture, np.random.default_rng([seed, _LABELS, index]), options, precision)
                 pictures.append(picture)
                 points.append(points_of(heat, options))
                 made += 1

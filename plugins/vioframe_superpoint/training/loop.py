@@ -20,17 +20,19 @@ from torch import Tensor, nn
 from vioframe.errors import ConfigError, DataError
 from vioframe.learning.callbacks.curve import Row, write_rows
 from vioframe.tracking import Tracker
+from vioframe_superpoint.net.superpoint import SuperPointNet
 from vioframe_superpoint.training.bar import Bar
 from vioframe_superpoint.training.data import MakeBatch, loader
 from vioframe_superpoint.training.precision import autocast
 from vioframe_superpoint.training.schedule import RateOptions, rate_factor
+from vioframe_superpoint.training.steps import laid_out
 
 log = logging.getLogger(__name__)
 
 RESUME_FILE = "resume.ckpt"
 FORMAT = "vioframe-superpoint-resume-1"
 
-StepLoss = Callable[[nn.Module, Mapping[str, Tensor], int], dict[str, Tensor]]
+StepLoss = Callable[[SuperPointNet, Mapping[str, Tensor], int], dict[str, Tensor]]
 """(net, batch, iteration) → losses by name, of which ``"loss"`` is minimised."""
 
 _BIASES_BELOW = 2
@@ -118,10 +120,10 @@ class Loop:
         session: where and for how long.
     """
 
-    def __init__(self, net: nn.Module, stage: Stage, session: Session) -> None:
+    def __init__(self, net: SuperPointNet, stage: Stage, session: Session) -> None:
         self.progress = Progress()
         # Other numbers would come out of other layouts in the last bits; this one is the fastest everywhere.
-        self._net = _laid_out(net)
+        self._net = laid_out(net)
         self._stage = stage
         self._session = session
         self._optimizer = _optimizer(net, stage.rate)
@@ -268,14 +270,6 @@ def read_resume(path: Path) -> dict[str, Any]:
             f"trainer.resume={path} is not a whole resume file of frontend=superpoint: begin anew"
         ) from error
     return dict(content)
-
-
-def _laid_out(net: nn.Module) -> nn.Module:
-    """The net with its weights as convolutions read them fastest."""
-    for parameter in net.parameters():
-        if parameter.ndim == 4:
-            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
-    return net
 
 
 def _optimizer(net: nn.Module, rate: RateOptions) -> torch.optim.Optimizer:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from vioframe_superpoint.net.superpoint import SuperPointNet
 from vioframe_superpoint.training.losses import DUSTBIN, descriptor_loss, detector_loss
@@ -26,9 +26,9 @@ class ShapesLoss:
     def __init__(self, corner_weight: float) -> None:
         self._weight = corner_weight
 
-    def __call__(self, net: nn.Module, batch: Mapping[str, Tensor], iteration: int) -> dict[str, Tensor]:
+    def __call__(self, net: SuperPointNet, batch: Mapping[str, Tensor], iteration: int) -> dict[str, Tensor]:
         """The loss of ``images`` (B, H, W) uint8 with ``classes`` (B, h, w)."""
-        logits = net.detector(net.encoder(as_float(batch["images"])))  # type: ignore[operator]
+        logits = net.detector(net.encoder(as_float(batch["images"])))
         weights = torch.full((DUSTBIN + 1,), self._weight, device=logits.device)
         weights[DUSTBIN] = 1.0
         return {"loss": F.cross_entropy(logits.float(), batch["classes"], weight=weights)}
@@ -51,7 +51,7 @@ class JointLoss:
     def __init__(self, options: DescriptorLoss) -> None:
         self._options = options
 
-    def __call__(self, net: nn.Module, batch: Mapping[str, Tensor], iteration: int) -> dict[str, Tensor]:
+    def __call__(self, net: SuperPointNet, batch: Mapping[str, Tensor], iteration: int) -> dict[str, Tensor]:
         """Losses of a batch, as :class:`~vioframe_superpoint.training.pairs.Pair` has it with an axis in front."""
         images = batch["images"]
         pairs = images.shape[0]
@@ -73,6 +73,14 @@ class JointLoss:
         detector = detectors[0] + detectors[1]
         loss = detector + self._options.weight * descriptors
         return {"loss": loss, "detector": detector, "descriptors": descriptors}
+
+
+def laid_out(net: SuperPointNet) -> SuperPointNet:
+    """The net with its weights as convolutions read them fastest."""
+    for parameter in net.parameters():
+        if parameter.ndim == 4:
+            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+    return net
 
 
 def as_float(images: Tensor) -> Tensor:
