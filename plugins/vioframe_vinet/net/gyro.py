@@ -134,8 +134,9 @@ class GyroCheck(nn.Module):
             gain = torch.where(fresh, variance / (variance + noise[:, k]), torch.zeros_like(variance))
             left = apart + share**2 * (1.0 - gain) * bias.variance
             kept.append(left / (apart + share**2 * bias.variance))
-            bias = Bias(bias.mean + gain * (lacking[:, k] - bias.mean), (1.0 - gain) * variance)
-            means.append(share * bias.mean)
+            # What errors are like is learned from how likely they are, not from what it does to the motions.
+            bias = Bias(bias.mean + gain.detach() * (lacking[:, k] - bias.mean), (1.0 - gain) * variance)
+            means.append(share.detach() * bias.mean)
             variances.append(apart + share**2 * bias.variance)
         found = Checked(
             torch.stack(means, dim=1) * usual,

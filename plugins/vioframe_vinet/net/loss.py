@@ -17,6 +17,9 @@ from vioframe_vinet.net.gyro import Sight
 
 # (rad/s)² and squared shares: the root of nothing has no gradient.
 _LEAST_VARIANCE = 1e-14
+# Variances learn from their likelihood alone, and an optimiser such as Adam minds no factor. But the gradients of all
+# are clipped together, and that of a likelihood may for once be larger than all others by far.
+_LIKELIHOOD_WEIGHT = 0.01
 # rad: what images show of rotation is weighed as if it erred by this.
 _SIGHT_UNIT = 0.002
 
@@ -93,9 +96,13 @@ class AccumulatedLikelihood(nn.Module):
         if answer.log_variances is None or answer.lasting is None:
             raise ValueError("a likelihood needs variances")
         losses: dict[str, Tensor] = self.means(answer, T_prev_cur, duration_s)
+        lasting = answer.lasting.variance
+        if lasting.shape[1] < min(self._horizons):
+            # So short a stretch does not show what lasts.
+            lasting = lasting.detach()
         errors = motion_errors(answer.T_prev_cur.detach(), T_prev_cur)
         variances = answer.log_variances.exp()
-        sigmas = answer.lasting.variance.clamp_min(_LEAST_VARIANCE).sqrt()
+        sigmas = lasting.clamp_min(_LEAST_VARIANCE).sqrt()
         R = compose(T_prev_cur)[..., :3, :3]
         counted = torch.ones_like(duration_s, dtype=torch.bool)
         # A rotation's error is in the axes at the pair's end, a translation's in those at its beginning.
@@ -118,7 +125,7 @@ class AccumulatedLikelihood(nn.Module):
         )
         likelihood = turned + moved
         named = {"likelihood_rotation": turned.detach(), "likelihood_translation": moved.detach()}
-        return {**losses, **named, "loss": losses["loss"] + likelihood}
+        return {**losses, **named, "loss": losses["loss"] + _LIKELIHOOD_WEIGHT * likelihood}
 
 
 def sight_loss(sight: Sight, visible: Tensor, T_prev_cur: Tensor) -> Tensor:
@@ -135,7 +142,7 @@ def sight_loss(sight: Sight, visible: Tensor, T_prev_cur: Tensor) -> Tensor:
     if not len(errors):
         return sight.vector.sum() * 0.0
     likelihood = 0.5 * (errors.detach().square() * torch.exp(-spread) + spread).sum(-1).mean()
-    return (errors / _SIGHT_UNIT).square().sum(-1).mean() + likelihood
+    return (errors / _SIGHT_UNIT).square().sum(-1).mean() + _LIKELIHOOD_WEIGHT * likelihood
 
 
 def motion_errors(T_found: Tensor, T_true: Tensor) -> Tensor:

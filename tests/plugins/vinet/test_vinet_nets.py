@@ -157,7 +157,7 @@ def test_it_learns_a_short_scene_through_the_front_end(loss):
     torch.manual_seed(0)
     front = PairEncoder(size_px=(96, 64), features=16, width=0.1, batch_norm=True, device="cpu")
     options = {"embedding": 16, "window": 3, "imu_hidden": 8, "hidden": 32, "joined": 16, "dropout": 0.0}
-    options |= {"lost_images": 0.0, "lost_imu": 0.0}
+    options |= {"lost_images": 0.0, "lost_imu": 0.0, "horizons": [2, 4]}
     fuser = VinetFuser(**options, translation_unit_m=0.1, loss=loss, device="cpu")
     whole = stored(make_scene())
     small = np.stack([cv2.resize(image, (96, 64), interpolation=cv2.INTER_AREA) for image in whole.images])
@@ -174,6 +174,8 @@ def test_it_learns_a_short_scene_through_the_front_end(loss):
         seen.append((losses["translation"].item(), losses["rotation"].item()))
         if len(seen) == 1:
             for name, parameter in nets.named_parameters():
+                if loss == "learned" and name.endswith(("gyro.lasting", "gyro.alike")):
+                    continue  # only a likelihood teaches these
                 assert parameter.grad is not None and parameter.grad.isfinite().all(), name
     assert seen[-1][0] < 0.5 * seen[0][0]
     assert seen[-1][1] ** 0.5 < 0.02
