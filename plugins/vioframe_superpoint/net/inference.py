@@ -31,7 +31,7 @@ class InferenceNet:
                 parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
         self._encoder = fused.encoder
         self._detector = fused.detector
-        first, last = cast(nn.Conv2d, fused.descriptor.wide[0]), fused.descriptor.last
+        first, last = (cast(nn.Conv2d, layer[0]) for layer in (fused.descriptor.wide, fused.descriptor.last))
         # As a matrix on the nine cells around a cell, whose channels lie together.
         self._patch = first.weight.permute(0, 2, 3, 1).reshape(len(first.weight), -1).contiguous()
         self._patch_bias = first.bias

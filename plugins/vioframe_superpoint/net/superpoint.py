@@ -32,12 +32,17 @@ class Head(nn.Module):
     Args:
         inputs: channels.
         outputs: channels.
+        centred: normalise what comes out. Vectors of a net that has learned nothing are else all but parallel, and
+            losses that push non-matches apart find no direction to do it in.
     """
 
-    def __init__(self, inputs: int, outputs: int) -> None:
+    def __init__(self, inputs: int, outputs: int, *, centred: bool) -> None:
         super().__init__()
         self.wide = convolution(inputs, HEAD_CHANNELS, active=nn.ReLU(inplace=True))
-        self.last = nn.Conv2d(HEAD_CHANNELS, outputs, 1)
+        last = (
+            convolution(HEAD_CHANNELS, outputs, 1) if centred else nn.Sequential(nn.Conv2d(HEAD_CHANNELS, outputs, 1))
+        )
+        self.last = last
 
     def forward(self, features: Tensor) -> Tensor:
         """(B, inputs, h, w) to (B, outputs, h, w)."""
@@ -55,8 +60,8 @@ class SuperPointNet(nn.Module):
     def __init__(self, encoder: EncoderNet) -> None:
         super().__init__()
         self.encoder = encoder
-        self.detector = Head(encoder.channels, DETECTOR_CHANNELS)
-        self.descriptor = Head(encoder.channels, DESCRIPTOR_CHANNELS)
+        self.detector = Head(encoder.channels, DETECTOR_CHANNELS, centred=False)
+        self.descriptor = Head(encoder.channels, DESCRIPTOR_CHANNELS, centred=True)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Run the net.
