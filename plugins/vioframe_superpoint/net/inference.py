@@ -31,7 +31,7 @@ class InferenceNet:
                 parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
         self._encoder = fused.encoder
         self._detector = fused.detector
-        first, last = (cast(nn.Conv2d, layer[0]) for layer in (fused.descriptor.wide, fused.descriptor.last))
+        first, last = cast(nn.Conv2d, fused.descriptor.wide[0]), fused.descriptor.last
         # As a matrix on the nine cells around a cell, whose channels lie together.
         self._patch = first.weight.permute(0, 2, 3, 1).reshape(len(first.weight), -1).contiguous()
         self._patch_bias = first.bias
@@ -74,6 +74,9 @@ class InferenceNet:
 def fold(net: SuperPointNet) -> SuperPointNet:
     """A copy for evaluation in which each convolution does what the batch normalisation after it did."""
     folded = copy.deepcopy(net).eval()
+    for head in (folded.detector, folded.descriptor):
+        if isinstance(head.centre, nn.BatchNorm2d):
+            head.last, head.centre = fuse_conv_bn_eval(head.last, head.centre), nn.Identity()
     for block in folded.modules():
         if not isinstance(block, nn.Sequential):
             continue

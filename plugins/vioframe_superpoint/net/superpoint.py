@@ -39,14 +39,12 @@ class Head(nn.Module):
     def __init__(self, inputs: int, outputs: int, *, centred: bool) -> None:
         super().__init__()
         self.wide = convolution(inputs, HEAD_CHANNELS, active=nn.ReLU(inplace=True))
-        last = (
-            convolution(HEAD_CHANNELS, outputs, 1) if centred else nn.Sequential(nn.Conv2d(HEAD_CHANNELS, outputs, 1))
-        )
-        self.last = last
+        self.last = nn.Conv2d(HEAD_CHANNELS, outputs, 1, bias=not centred)
+        self.centre: nn.Module = nn.BatchNorm2d(outputs) if centred else nn.Identity()
 
     def forward(self, features: Tensor) -> Tensor:
         """(B, inputs, h, w) to (B, outputs, h, w)."""
-        answer: Tensor = self.last(self.wide(features))
+        answer: Tensor = self.centre(self.last(self.wide(features)))
         return answer
 
 
