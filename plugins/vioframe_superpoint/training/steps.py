@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Mapping
+from typing import cast
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from vioframe_superpoint.net.superpoint import SuperPointNet
 from vioframe_superpoint.training.losses import DUSTBIN, descriptor_loss, detector_loss
@@ -35,10 +36,9 @@ class ShapesLoss:
 
     def take_back(self, net: SuperPointNet) -> None:
         """Make the answers of a net those of one that learned with a weight of 1."""
-        bias = net.detector.last.bias
-        if bias is not None:
-            with torch.no_grad():
-                bias[:DUSTBIN] -= math.log(self._weight)
+        last = cast(nn.Conv2d, net.detector.last[0])
+        with torch.no_grad():
+            cast(Tensor, last.bias)[:DUSTBIN] -= math.log(self._weight)
 
 
 class JointLoss:

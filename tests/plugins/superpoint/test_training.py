@@ -372,3 +372,45 @@ def test_front_end_has_a_training_of_its_own():
 def test_time_is_that_of_all_sessions(whole):
     state = final_state(whole[0])
     assert 0.0 < state["seconds"] < time.monotonic()
+
+
+SMALL = [
+    "task=train",
+    "frontend=superpoint",
+    "encoder=mobilenetv2",
+    "encoder.width=0.25",
+    "descriptor_loss=sparse_triplet",
+    "tracker=none",
+    "progress=false",
+    "frontend.training.iterations=4",
+    "frontend.training.batch_size=2",
+    "frontend.training.save_every=2",
+    "frontend.training.validate_every=2",
+    "frontend.training.pairs.size_px=[64,48]",
+    "frontend.training.shapes.iterations=2",
+    "frontend.training.shapes.batch_size=2",
+    "frontend.training.shapes.size_px=[64,48]",
+    "frontend.training.pictures.count=2",
+    "frontend.training.pictures.held_out=1",
+    "frontend.training.pictures.places=0.0",
+    "frontend.training.pictures.size_px=[96,64]",
+    "frontend.training.adaptation.homographies=2",
+]
+
+
+def test_a_user_trains_stops_and_goes_on(cli, tmp_path):
+    done = cli(*SMALL, "hydra.run.dir=one", "frontend.training.max_minutes=1e-9")
+    assert done.returncode == 0, done.stderr
+    assert "go on with trainer.resume=" in done.stdout + done.stderr
+    resumed = cli(*SMALL, "hydra.run.dir=two", "trainer.resume=one/resume.ckpt")
+    assert resumed.returncode == 0, resumed.stderr
+    assert "frontend.weights=" in resumed.stdout + resumed.stderr
+    weights = tmp_path / "one" / "weights" / "superpoint-mobilenetv2.safetensors"
+    assert read_card(weights)["iterations"] == 4
+
+
+def test_resume_without_a_file_is_one_sentence(cli):
+    done = cli(*SMALL, "trainer.resume=nowhere/resume.ckpt")
+    assert done.returncode != 0
+    assert "there is no resume.ckpt in nowhere" in done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
