@@ -36,7 +36,7 @@ class ShapesLoss:
 
     def take_back(self, net: SuperPointNet) -> None:
         """Make the answers of a net those of one that learned with a weight of 1."""
-        last = cast(nn.Conv2d, net.detector.last[0])
+        *_, last = (layer for layer in net.detector.modules() if isinstance(layer, nn.Conv2d))
         with torch.no_grad():
             cast(Tensor, last.bias)[:DUSTBIN] -= math.log(self._weight)
 
