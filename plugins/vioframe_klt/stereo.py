@@ -5,8 +5,8 @@ import numpy as np
 from vioframe.checks import Array, Mask, Stamps
 from vioframe.geometry import camera as projection
 from vioframe.types import Image, Tracks
-from vioframe.vision.two_cameras import TwoCameras
 from vioframe.vision.anchors import Anchors
+from vioframe.vision.two_cameras import TwoCameras
 from vioframe_klt.points import inside
 from vioframe_klt.search import Search
 

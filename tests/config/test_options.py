@@ -65,7 +65,9 @@ SMALLER = {"cnn_vins": ("frontend.weights=null", "encoder=mobilenetv2", "encoder
 @pytest.mark.parametrize("system", offered("system"))
 def test_preset_runs_two_simulated_seconds(system, tmp_path):
     smaller = SMALLER.get(system, ())
-    config = composed(f"system={system}", *smaller, "dataset.duration_s=2", "dataset.standstill_s=0", "init=groundtruth")
+    config = composed(
+        f"system={system}", *smaller, "dataset.duration_s=2", "dataset.standstill_s=0", "init=groundtruth"
+    )
     pipeline = build_pipeline(config, {})
     dataset = build(config, "dataset", Dataset)
     recording = dataset.open(dataset.sequences[0])
