@@ -58,7 +58,7 @@ def main() -> None:
         for name, options in LOSSES.items():
             steps[encoder, name] = _step(encoder, options, batch, device, precision)
     for name, options in LOSSES.items():
-        steps["", name] = _alone(options, batch, tuple(arguments.size), device)
+        steps["", name] = _alone(options, batch, tuple(arguments.size), device, precision)
     seconds: dict[tuple[str, str], list[float]] = {key: [] for key in steps}
     for number in range(arguments.rounds + 1):
         for key, step in steps.items():
@@ -116,7 +116,11 @@ def _step(
 
 
 def _alone(
-    options: DescriptorLoss, batch: dict[str, torch.Tensor], size_px: tuple[int, int], device: torch.device
+    options: DescriptorLoss,
+    batch: dict[str, torch.Tensor],
+    size_px: tuple[int, int],
+    device: torch.device,
+    precision: str,
 ) -> Callable[[], None]:
     pairs = batch["H"].shape[0]
     shape = (pairs, 256, size_px[1] // 8, size_px[0] // 8)
@@ -125,15 +129,16 @@ def _alone(
     points, overlap = batch["points"], batch["overlap"]
 
     def step() -> None:
-        loss = descriptor_loss(
-            options,
-            *maps,
-            batch["H"],
-            points=(points[:, 0], points[:, 1]),
-            matched=batch["matched"],
-            valid=(overlap[:, 0], overlap[:, 1]),
-            seed=0,
-        )
+        with autocast(device, precision):
+            loss = descriptor_loss(
+                options,
+                *maps,
+                batch["H"],
+                points=(points[:, 0], points[:, 1]),
+                matched=batch["matched"],
+                valid=(overlap[:, 0], overlap[:, 1]),
+                seed=0,
+            )
         loss.backward()
 
     return step
