@@ -9,6 +9,7 @@ import numpy as np
 
 from vioframe.checks import Array, check_positive
 from vioframe.errors import ConfigError
+from vioframe.learning import SHIPPED
 from vioframe.learning.holder import NetHolder
 from vioframe.types import Image
 from vioframe.vision.corners import place_corners
@@ -21,9 +22,6 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from vioframe_superpoint.net.inference import InferenceNet
-
-SHIPPED = "shipped"
-"""Value of the option ``weights`` that stands for the file that came with this package."""
 
 _FOLDER = Path(__file__).parent / "weights"
 _CELL_PX = 8
@@ -165,15 +163,15 @@ class SuperPointExtractor:
         with torch.inference_mode():
             for first in range(0, len(grays), step):
                 chosen = grays[first : first + step]
-                heats, features = self._see(ready, chosen, device)
+                heats, features = self._see(ready, chosen, allowed, device)
                 for gray, heat, kept, map_ in zip(chosen, *heats, features, strict=True):
-                    found.append(self._points(ready, gray, allowed, heat, kept, map_))
+                    found.append(self._points(ready, gray, heat, kept, map_))
         return found
 
     def _see(
-        self, ready: "InferenceNet", grays: Sequence[Image], device: "torch.device"
+        self, ready: "InferenceNet", grays: Sequence[Image], allowed: np.ndarray, device: "torch.device"
     ) -> "tuple[tuple[Tensor, Tensor], Tensor]":
-        """Heat (B, H, W), the same with its maxima alone, and the maps that descriptors are made of."""
+        """Heat (B, H, W), the same with its allowed maxima alone, and the maps that descriptors are made of."""
         import torch
 
         from vioframe_superpoint.net.keypoints import suppress
@@ -187,7 +185,9 @@ class SuperPointExtractor:
         images = torch.from_numpy(np.stack(padded)).to(device)[:, None].float() / 255.0
         heat, features = ready.detect(images)
         heat = heat[:, :height, :width].contiguous()
-        return (heat, suppress(heat, self._options.suppression_px)), features
+        # What may not be taken must not keep its neighbours from being taken either.
+        open_to = torch.where(torch.from_numpy(allowed != 0).to(device), heat, 0.0)
+        return (heat, suppress(open_to, self._options.suppression_px)), features
 
     @property
     def _ready(self) -> "InferenceNet":
@@ -201,7 +201,6 @@ class SuperPointExtractor:
         self,
         ready: "InferenceNet",
         gray: Image,
-        allowed: np.ndarray,
         heat: "Tensor",
         kept: "Tensor",
         features: "Tensor",
@@ -211,8 +210,7 @@ class SuperPointExtractor:
         rows, columns = torch.nonzero(kept >= self._options.lowest_threshold, as_tuple=True)
         scores = kept[rows, columns].cpu().numpy()
         places = torch.stack([columns, rows], dim=-1).cpu().numpy()
-        inside = np.flatnonzero(allowed[places[:, 1], places[:, 0]])
-        chosen = inside[self._choose(places[inside], scores[inside], gray.shape)]
+        chosen = self._choose(places, scores, gray.shape)
         if len(chosen) == 0:
             return Keypoints(
                 pixels=np.zeros((0, 2)), scores=np.zeros(0), descriptors=np.zeros((0, _DESCRIPTOR), np.float32)

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vioframe.errors import ConfigError
-from vioframe.learning import require_torch
+from vioframe.learning import SHIPPED, require_torch
 from vioframe.types import Frame, SensorRig, VisualFeatures
 from vioframe.vision.descriptor_frontend import DescriptorFrontend
 from vioframe.vision.keeper import KeeperOptions
 from vioframe.vision.placing import AnchorOptions
-from vioframe_superpoint.extractor import SHIPPED, SuperPointExtractor
+from vioframe_superpoint.extractor import SuperPointExtractor
 from vioframe_superpoint.options import Encoder, Refinement
 from vioframe_superpoint.training import TrainingOptions
 

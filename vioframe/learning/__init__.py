@@ -9,6 +9,9 @@ from importlib.util import find_spec
 
 from vioframe.errors import ConfigError
 
+SHIPPED = "shipped"
+"""Value of an option ``weights`` that stands for what came with the part's package, in its folder ``weights``."""
+
 
 def require_torch(what: str, *, training: bool = False) -> None:
     """Refuse to go on without the libraries that nets need.

@@ -35,6 +35,10 @@ _NO_BEARING = (
     "report_frames",
     "trainer",
     "training_data",
+    # Chosen by themselves, they stand in the part that they are for.
+    "backbone",
+    "encoder",
+    "descriptor_loss",
 )
 # Characters of what is told of a failed cell.
 _LONGEST_ERROR = 400
@@ -84,8 +88,8 @@ def cell_key(config: DictConfig) -> str:
         ConfigError: an option leads nowhere, or is missing.
     """
     plain = {str(name): _plain(config, str(name)) for name in config if name not in _NO_BEARING}
-    # Whether figures are drawn changes no number.
-    words = [__version__, bearing(plain, without=("plots",))]
+    # Whether figures are drawn changes no number, nor does how a part would train itself.
+    words = [__version__, bearing(plain, without=("plots", "training"))]
     return hashlib.sha256(json.dumps(words, sort_keys=True, default=str).encode()).hexdigest()[:24]
 
 

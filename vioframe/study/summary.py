@@ -237,11 +237,15 @@ class StudySummary:
         return numbers
 
     def _by_run(self, variant: str, value: Value, column: Column) -> dict[tuple[str, int], float | None]:
-        """The metric by recording and seed, of the cells that finished; infinitely bad where a run failed."""
+        """The metric by recording and seed; infinitely bad where a run failed.
+
+        Where variants are compared, an error is such a failure too: left out, it would spare its variant the recording.
+        """
         return {
             cell.run: self._number(result, column)
             for cell, result in self.results.items()
-            if (cell.variant, cell.value) == (variant, value) and result.status == "finished"
+            if (cell.variant, cell.value) == (variant, value)
+            and (result.status == "finished" or self.study.baseline is not None)
         }
 
     def runs(self, variant: str, value: Value, column: Column) -> list[float | None]:
@@ -255,7 +259,7 @@ class StudySummary:
         return {name: number for name, number in result.metrics.items() if name == "completion"}
 
     def _number(self, result: CellResult, column: Column) -> float | None:
-        if column.key != "completion" and self._too_short(result):
+        if column.key != "completion" and (result.status != "finished" or self._too_short(result)):
             return math.inf if column.lower_is_better else -math.inf
         return result.metrics.get(column.key)
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from vioframe.learning import SHIPPED
+
 # Where and how fast, not what.
 _WITHOUT = ("device", "cache")
 
@@ -31,7 +33,10 @@ def bearing(node: object, without: Sequence[str] = ()) -> object:
     source = kept.get("weights")
     if isinstance(source, str):
         file = Path(source).expanduser()
-        kept["weights"] = _hash(file) if file.is_file() else (_shipped(kept) or source)
+        if file.is_file():
+            kept["weights"] = _hash(file)
+        elif source == SHIPPED:
+            kept["weights"] = _shipped(kept) or source
     return kept
 
 

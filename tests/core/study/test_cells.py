@@ -36,8 +36,8 @@ def test_key_follows_the_content_of_weights_that_came_with_a_package(tmp_path, m
     (tmp_path / "acme_net" / "__init__.py").write_text("raise RuntimeError('no key needs an import')")
     monkeypatch.syspath_prepend(tmp_path)
 
-    def key(name="small"):
-        options = {"_target_": "acme_net.Part", "weights": "shipped", "encoder": {"name": name}}
+    def key(name="small", weights="shipped"):
+        options = {"_target_": "acme_net.Part", "weights": weights, "encoder": {"name": name}}
         return cell_key(OmegaConf.create({"frontend": options}))
 
     keys = [key()]
@@ -46,6 +46,8 @@ def test_key_follows_the_content_of_weights_that_came_with_a_package(tmp_path, m
         keys.append(key())
     # The last file is that of another encoder.
     assert len(set(keys[:3])) == 3 and keys[3] == keys[2] != key("large")
+    # What lies elsewhere is not what came with the package.
+    assert len({key(weights="runs:/A/w"), key(weights="runs:/B/w"), key()}) == 3
 
 
 def test_option_that_leads_nowhere_is_named():

@@ -31,7 +31,7 @@ def study(*overrides: str) -> Study:
     return build(composed(*SMALL, *overrides), "study", Study)
 
 
-def summary(factors, *overrides, completion=None):
+def summary(factors, *overrides, completion=None, errors=()):
     """Of a study in which a variant has ``factors[variant][condition]`` times the error of the recording and seed."""
     plan = study(*overrides)
     results = {}
@@ -40,6 +40,8 @@ def summary(factors, *overrides, completion=None):
         metrics = {"ate_se3_m": error * factors[cell.variant][cell.value], "completion": 0.97}
         metrics["completion"] = (completion or {}).get((cell.variant, cell.value, *cell.run), 0.97)
         results[cell] = CellResult(key="k", status="finished", metrics=metrics)
+        if (cell.variant, cell.value, *cell.run) in errors:
+            results[cell] = CellResult(key="k", status="failed", error="it fell")
     return StudySummary(plan, results)
 
 
@@ -118,6 +120,15 @@ def test_run_that_tracks_too_little_failed_and_is_the_worst(capsys):
     print_study(told)
     printed = capsys.readouterr().out
     assert "failed" in printed and "tracked less than 80 %" in printed and "none" in printed
+
+
+def test_run_that_ended_in_an_error_is_the_worst_where_variants_are_compared():
+    """Left out, it would spare its variant the recording that it cannot do."""
+    told = summary({"vins_mono": CALM, "vins_orb": BETTER}, errors={("vins_orb", "dark_weak", "V1", 0)})
+    spread = told.spread("vins_orb", "dark_weak", ATE)
+    assert (spread.failed, spread.runs) == (1, 6) and math.isinf(spread.high)
+    compared = told.comparison("vins_orb", ["dark_weak"], ATE)
+    assert (compared.pairs, compared.better, compared.worse) == (6, 5, 1)
 
 
 def test_page_and_numbers_hold_conditions_recordings_and_comparisons(tmp_path):
