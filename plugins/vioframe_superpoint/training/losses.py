@@ -40,7 +40,7 @@ def descriptor_loss(
     valid: tuple[Tensor, Tensor],
     seed: int,
 ) -> Tensor:
-    """The loss that ``options`` asks for, before its weight λ.
+    """The loss that ``options`` asks for, before its weight λ; in single precision, whatever the net computes in.
 
     Args:
         options: which, and its numbers.
@@ -52,13 +52,16 @@ def descriptor_loss(
         valid: (B, h, w) bool, cells of the first that the second shows, and the reverse; for the dense loss.
         seed: of what a loss draws.
     """
-    if isinstance(options, DenseLoss):
-        return dense_loss(options, first, second, H, valid)
-    descriptors = (sample_descriptors(first, points[0]), sample_descriptors(second, points[1]))
-    if isinstance(options, SparseHingeLoss):
-        return sparse_hinge_loss(options, *descriptors, points[1], matched, seed)
-    if isinstance(options, SparseTripletLoss):
-        return sparse_triplet_loss(options, *descriptors, points, matched)
+    # With 8 bits of mantissa a coordinate of some hundred px would be a pixel or two off.
+    with torch.autocast(first.device.type, enabled=False):
+        first, second = first.float(), second.float()
+        if isinstance(options, DenseLoss):
+            return dense_loss(options, first, second, H, valid)
+        descriptors = (sample_descriptors(first, points[0]), sample_descriptors(second, points[1]))
+        if isinstance(options, SparseHingeLoss):
+            return sparse_hinge_loss(options, *descriptors, points[1], matched, seed)
+        if isinstance(options, SparseTripletLoss):
+            return sparse_triplet_loss(options, *descriptors, points, matched)
     raise TypeError(f"{type(options).__name__} is no loss of descriptors")
 
 

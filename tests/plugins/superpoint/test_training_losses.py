@@ -150,6 +150,35 @@ def test_triplet_takes_no_negative_beside_the_match_and_none_that_is_not_there()
 
 
 @pytest.mark.parametrize("options", [DENSE, HINGE, TRIPLET], ids=lambda options: type(options).__name__)
+def test_losses_are_computed_in_single_precision_whatever_the_net_computes_in(options):
+    # Far from the origin, where bf16 knows coordinates to 2 px; the radius is within a pixel of a warped centre.
+    generator = torch.Generator().manual_seed(2)
+    rows, columns = 30, 40
+    maps = [torch.randn(1, CHANNELS, rows, columns, generator=generator).bfloat16() for _ in range(2)]
+    H = torch.tensor([[[1.01, 0.02, 3.3], [-0.01, 0.99, -2.7], [1e-5, 2e-5, 1.0]]])
+    centres = cell_centres(rows, columns)[None]
+    points = (centres, warp(centres, H))
+    shown = torch.ones(1, rows, columns, dtype=torch.bool)
+
+    def loss(first, second):
+        return descriptor_loss(
+            options,
+            first,
+            second,
+            H,
+            points=points,
+            matched=torch.ones(1, rows * columns, dtype=torch.bool),
+            valid=(shown, shown),
+            seed=0,
+        )
+
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        mixed = loss(*maps)
+    assert mixed.dtype == torch.float32
+    assert float(mixed) == float(loss(*(each.float() for each in maps)))
+
+
+@pytest.mark.parametrize("options", [DENSE, HINGE, TRIPLET], ids=lambda options: type(options).__name__)
 def test_losses_have_gradients_that_bring_matches_together(options):
     generator = torch.Generator().manual_seed(1)
     first = torch.randn(2, CHANNELS, ROWS, COLUMNS, generator=generator)

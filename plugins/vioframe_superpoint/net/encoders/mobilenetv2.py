@@ -47,7 +47,8 @@ class MobileNetV2(EncoderNet):
     def __init__(self, width: float = 1.0) -> None:
         sizes = [divisible(width * channels, 8) for channels in (STEM, *(row[1] for row in BOTTLENECKS))]
         super().__init__(sizes[-1])
-        layers: list[nn.Module] = [convolution(1, sizes[0], stride=2, active=nn.ReLU6(inplace=True))]
+        # Table 1 prints ReLU here; MobileNetV2 itself, whose blocks follow, has ReLU6 throughout.
+        layers: list[nn.Module] = [convolution(1, sizes[0], stride=2, active=nn.ReLU(inplace=True))]
         for (expansion, _, stride), inputs, outputs in zip(BOTTLENECKS, sizes, sizes[1:], strict=False):
             layers.append(InvertedResidual(inputs, outputs, expansion, stride))
         self.layers = nn.Sequential(*layers)
