@@ -102,8 +102,8 @@ def generated_pairs(split: Split, count: int, size_px: Sequence[int], seed: int 
 def _generate(split: Split, count: int, size_px: tuple[int, int], seed: int) -> Iterator[PicturePair]:
     margin = 0 if split == "illumination" else round(_MARGIN * min(size_px))
     large = size_px[0] + 2 * margin, size_px[1] + 2 * margin
-    places = RenderedPlaces(size_px=large, count=count, seed=seed, each=_PICTURES_IN_A_PLACE, held_out=True)
-    textures = Textures(size_px=large, count=count, seed=seed, held_out=True)
+    places = RenderedPlaces(size_px=large, count=count, seed=seed, each=_PICTURES_IN_A_PLACE, purpose="held_out")
+    textures = Textures(size_px=large, count=count, seed=seed, purpose="held_out")
     source = Mixture([places, textures], [_PLACES_SHARE, 1.0 - _PLACES_SHARE], count=count, seed=seed)
     for index in range(count):
         rng = np.random.default_rng([seed, _PAIRS, SPLITS.index(split), index])

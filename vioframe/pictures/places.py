@@ -13,7 +13,7 @@ from vioframe.data.simulator.render import Renderer
 from vioframe.data.simulator.texture import Atlas, to_grey
 from vioframe.data.simulator.world import World
 from vioframe.pictures.lighting import change_light
-from vioframe.pictures.sources import COMMON_LIGHT, TRIES, check_size, shows_something
+from vioframe.pictures.sources import COMMON_LIGHT, TRIES, Purpose, check_size, shows_something
 from vioframe.types import Camera, Image
 
 # Streets are cheap to build and differ most.
@@ -22,7 +22,8 @@ _DURATION_S = 20.0
 _CLEARANCE_M = 0.3
 _TRIES = 30
 _FOCAL_LENGTHS = (0.5, 0.75, 1.1)
-_PLACES, _HELD_OUT_PLACES = 76, 77
+# Tags that keep the random numbers of one purpose apart from those of the others.
+_TAGS: dict[Purpose, int] = {"training": 76, "held_out": 77, "validation": 80}
 # The simulator's seeds of training, validation and test lie far below.
 _FIRST_WORLD = 5_000_000
 # Body axes x forward, y left, z up into the camera's x right, y down, z forward.
@@ -39,18 +40,18 @@ class RenderedPlaces:
         count: how many.
         seed: of all.
         each: pictures in a place.
-        held_out: others than those of the same seed for training.
+        purpose: what they are for.
     """
 
     def __init__(
-        self, *, size_px: Sequence[int], count: int, seed: int = 0, each: int = 80, held_out: bool = False
+        self, *, size_px: Sequence[int], count: int, seed: int = 0, each: int = 80, purpose: Purpose = "training"
     ) -> None:
         check_positive("pictures", count=count, each=each)
         self._size_px = check_size("pictures", size_px)
         self._count = count
         self._seed = seed
         self._each = each
-        self._tag = _HELD_OUT_PLACES if held_out else _PLACES
+        self._tag = _TAGS[purpose]
         self._place: _Place | None = None
 
     def __len__(self) -> int:

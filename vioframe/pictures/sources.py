@@ -7,7 +7,7 @@ anything else, and a picture can be made again instead of being kept.
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import cv2
 import numpy as np
@@ -53,7 +53,7 @@ COMMON_LIGHT = LightingOptions(
 views of one picture they would be a part of the scene."""
 
 # Tags that keep the random numbers of one purpose apart from those of all others.
-_TEXTURES, _HELD_OUT_TEXTURES, _MIXTURE = 72, 73, 75
+_TEXTURES, _HELD_OUT_TEXTURES, _MIXTURE, _VALIDATION_TEXTURES = 72, 73, 75, 79
 _TEXTURES_OF_A_KIND = 12
 _FRESH = 0.22
 _SLANTS = HomographyOptions(patch_ratio=0.9, perspective=0.25, scale=0.3, max_angle=float(np.pi), overflow=0.0)
@@ -64,6 +64,16 @@ _LEAST_DEVIATION_DN = 5.0
 _LEAST_SHARE = 0.3
 TRIES = 4
 """How often a picture is made until it shows something."""
+
+
+Purpose = Literal["training", "validation", "held_out"]
+"""Pictures of one purpose have nothing in common with those of another, whatever the seeds."""
+
+_TAGS: dict[Purpose, int] = {
+    "training": _TEXTURES,
+    "validation": _VALIDATION_TEXTURES,
+    "held_out": _HELD_OUT_TEXTURES,
+}
 
 
 class PictureSource(Protocol):
@@ -98,15 +108,15 @@ class Textures:
         size_px: (width, height).
         count: how many.
         seed: of all.
-        held_out: others than those of the same seed for training.
+        purpose: what they are for.
     """
 
-    def __init__(self, *, size_px: Sequence[int], count: int, seed: int = 0, held_out: bool = False) -> None:
+    def __init__(self, *, size_px: Sequence[int], count: int, seed: int = 0, purpose: Purpose = "training") -> None:
         check_positive("pictures", count=count)
         self._size_px = check_size("pictures", size_px)
         self._count = count
         self._seed = seed
-        self._tag = _HELD_OUT_TEXTURES if held_out else _TEXTURES
+        self._tag = _TAGS[purpose]
         self._bank = TextureBank([seed, self._tag], _TEXTURES_OF_A_KIND * len(PAINTERS))
         self._scenes = tuple(SCENES)
         self._shares = np.array([SCENES[name][0] for name in self._scenes])

@@ -2,7 +2,7 @@
 
 ==============  =======================================================================================
 ``options``     ``frontend.training`` and ``descriptor_loss``, without torch
-``stages``      the whole training, stage by stage, and what is kept of it
+``stages``      the whole training, stage by stage, and what is kept of it; ``cards``: what is told of that
 ``losses``      of the detector, and three of the descriptors
 ``pairs``       two views of a picture in different light, without torch
 ``labels``      labelled pictures on disk, and points as classes of cells

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import torch
 
-from vioframe.checks import Array
+from vioframe.checks import Array, Mask
 from vioframe.pictures import sample_homography, valid_mask, warp_picture
 from vioframe.types import Image
 from vioframe_superpoint.net.keypoints import heatmap, suppress
@@ -19,8 +19,8 @@ _REACH = 2
 
 def adapted_heat(
     net: SuperPointNet, picture: Image, rng: np.random.Generator, options: AdaptationOptions, precision: str = "32"
-) -> Array:
-    """Mean heat (H, W) over the views that show a pixel; zero where too few do.
+) -> tuple[Array, Mask]:
+    """Mean heat (H, W) over the views that show a pixel, and where enough do, (H, W) bool; elsewhere it is zero.
 
     Args:
         net: on its device, in evaluation mode.
@@ -44,9 +44,9 @@ def adapted_heat(
             flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
             total += cv2.warpPerspective(answer * shown, H, size, flags=flags)
             views += cv2.warpPerspective(shown, H, size, flags=flags)
-    enough = views >= options.least_views * len(homographies)
+    enough: Mask = views >= options.least_views * len(homographies)
     mean: Array = np.where(enough, total / np.maximum(views, 1e-6), 0.0)
-    return mean
+    return mean, enough
 
 
 def points_of(heat: Array, options: AdaptationOptions) -> Array:

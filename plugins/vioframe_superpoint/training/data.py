@@ -81,7 +81,11 @@ class PairBatches:
         for place in range(iteration * self._batch_size, (iteration + 1) * self._batch_size):
             number = self._drawn(place)
             rng = np.random.default_rng([self._seed, _PAIRS, place])
-            pairs.append(make_pair(self._pictures.pictures[number], self._pictures.points[number], rng, self._options))
+            pictures = self._pictures
+            pair = make_pair(
+                pictures.pictures[number], pictures.points[number], rng, self._options, pictures.seen_in(number)
+            )
+            pairs.append(pair)
         return stack_pairs(pairs)
 
     def _drawn(self, place: int) -> int:

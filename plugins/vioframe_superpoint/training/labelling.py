@@ -66,17 +66,19 @@ def label_pictures(
             if made and until is not None and time.monotonic() >= until:
                 return False
             started = time.perf_counter()
-            pictures, points = [], []
+            pictures, points, seen = [], [], []
             for index in range(first, min(first + CHUNK, total)):
                 picture = source.picture(index)
-                heat = adapted_heat(folded, picture, np.random.default_rng([seed, _LABELS, index]), options, precision)
+                rng = np.random.default_rng([seed, _LABELS, index])
+                heat, enough = adapted_heat(folded, picture, rng, options, precision)
                 pictures.append(picture)
                 points.append(points_of(heat, options))
+                seen.append(enough)
                 made += 1
                 if bar is not None:
                     bar.show(index)
                     bar.advance(index + 1, made / max(time.monotonic() - began, 1e-9))
-            store.write(chunk, pictures, points, time.perf_counter() - started)
+            store.write(chunk, pictures, points, seen, time.perf_counter() - started)
     finally:
         if bar is not None:
             bar.close()

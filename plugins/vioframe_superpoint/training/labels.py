@@ -1,12 +1,13 @@
 """Labelled pictures on disk: made once, in chunks, and read by every training that is given the folder.
 
 A folder holds ``labels.json``, which says what made it, and for each chunk ``pictures-NNNN.npy`` (n, H, W) uint8 and
-``points-NNNN.npz`` with ``points`` (P, 2) float32 px, picture after picture, and ``counts`` (n,), and the
-``seconds`` it took. A chunk appears whole
-or not at all, its points last, so that making them can be stopped and gone on with.
+``points-NNNN.npz`` with ``points`` (P, 2) float32 px, picture after picture, and ``counts`` (n,), the
+``seconds`` it took, and ``seen`` (n, ⌈H W / 8⌉), bits of which pixels were looked at often enough to have a label. A
+chunk appears whole or not at all, its points last, so that making them can be stopped and gone on with.
 """
 
 import json
+import logging
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +22,12 @@ from vioframe.errors import DataError
 from vioframe.types import Image
 
 ABOUT_FILE = "labels.json"
-FORMAT = "vioframe-superpoint-labels-1"
+FORMAT = "vioframe-superpoint-labels-2"
+"""The first had no ``seen``: all pixels count as looked at."""
+
+_OLD_FORMAT = "vioframe-superpoint-labels-1"
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -31,15 +37,34 @@ class LabelledPictures:
     Attributes:
         pictures: each (H, W) uint8.
         points: of each, (P, 2) px.
+        seen: of each, bits of the pixels that may have a label.
         about: what made them.
     """
 
     pictures: Sequence[Image]
     points: Sequence[Array]
+    seen: Sequence[NDArray[np.uint8]]
     about: Mapping[str, Any]
 
     def __len__(self) -> int:
         return len(self.pictures)
+
+    def seen_in(self, number: int) -> Mask:
+        """Where in a picture (H, W) bool there may be labels: elsewhere that there is none says nothing."""
+        height, width = self.pictures[number].shape
+        bits = np.unpackbits(self.seen[number], count=height * width)
+        mask: Mask = bits.reshape(height, width).astype(np.bool_)
+        return mask
+
+    def parted(self, last: int) -> "tuple[LabelledPictures, LabelledPictures]":
+        """All but the last so many, and those."""
+        one, other = (
+            LabelledPictures(
+                pictures=self.pictures[part], points=self.points[part], seen=self.seen[part], about=self.about
+            )
+            for part in (slice(None, -last), slice(-last, None))
+        )
+        return one, other
 
 
 class LabelStore:
@@ -60,17 +85,28 @@ class LabelStore:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         plain = json.loads(json.dumps(about))
-        if (self.folder / ABOUT_FILE).exists():
-            stored = {name: value for name, value in self.about().items() if name not in ("format", "told")}
-            differing = [name for name in sorted({*plain, *stored}) if plain.get(name) != stored.get(name)]
+        if self.exists:
+            differing = self.differing({"format": FORMAT, **about})
             if differing:
-                name = differing[0]
                 raise DataError(
-                    f"{self.folder} was begun with other {name} ({_short(stored.get(name))}, not "
-                    f"{_short(plain.get(name))}): name another folder (frontend.training.labels) or delete it"
+                    f"{self.folder} was begun with other {differing[0]}: name another folder "
+                    "(frontend.training.labels) or delete it"
                 )
             return
         _write_text(self.folder / ABOUT_FILE, json.dumps({"format": FORMAT, **plain}, indent=2) + "\n")
+
+    def differing(self, about: Mapping[str, Any]) -> list[str]:
+        """In what the folder was begun otherwise than ``about`` says, with both values.
+
+        Raises:
+            DataError: it is damaged, or not one.
+        """
+        plain, stored = json.loads(json.dumps(about)), self.about()
+        return [
+            f"{name} ({_short(stored.get(name))}, not {_short(plain[name])})"
+            for name in sorted(plain)
+            if plain[name] != stored.get(name)
+        ]
 
     def about(self) -> dict[str, Any]:
         """What ``labels.json`` says.
@@ -83,7 +119,7 @@ class LabelStore:
             about = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise DataError(f"{path} cannot be read ({error}): delete the folder, or name another") from error
-        if not isinstance(about, dict) or about.get("format") != FORMAT:
+        if not isinstance(about, dict) or about.get("format") not in (FORMAT, _OLD_FORMAT):
             raise DataError(f"{path} does not describe labelled pictures of vioframe: name another folder")
         return about
 
@@ -106,15 +142,28 @@ class LabelStore:
         """Whether a chunk is there."""
         return self._points(chunk).exists()
 
-    def write(self, chunk: int, pictures: Sequence[Image], points: Sequence[Array], seconds: float = 0.0) -> None:
-        """Write a chunk that took so many seconds."""
+    def write(
+        self,
+        chunk: int,
+        pictures: Sequence[Image],
+        points: Sequence[Array],
+        seen: Sequence[Mask],
+        seconds: float = 0.0,
+    ) -> None:
+        """Write a chunk that took so many seconds: pictures (H, W), their points (P, 2) px and what was seen (H, W)."""
         partial = self.folder / f"chunk-{chunk:04d}.partial"
         with partial.open("wb") as file:
             np.save(file, np.stack(pictures), allow_pickle=False)
         os.replace(partial, self._pictures(chunk))
         counts = np.array([len(each) for each in points], dtype=np.int64)
         with partial.open("wb") as file:
-            np.savez(file, points=np.concatenate(points).astype(np.float32), counts=counts, seconds=seconds)
+            np.savez(
+                file,
+                points=np.concatenate(points).astype(np.float32),
+                counts=counts,
+                seen=np.stack([np.packbits(each) for each in seen]),
+                seconds=seconds,
+            )
         os.replace(partial, self._points(chunk))
 
     def seconds(self) -> float:
@@ -126,8 +175,8 @@ class LabelStore:
             chunk += 1
         return total
 
-    def read_chunk(self, chunk: int) -> tuple[Array, list[Array]]:
-        """Pictures (n, H, W), which stay on disk until looked at, and the points of each.
+    def read_chunk(self, chunk: int) -> tuple[Array, list[Array], NDArray[np.uint8]]:
+        """Pictures (n, H, W), which stay on disk until looked at, points of each, and bits (n, ...) of what was seen.
 
         Raises:
             DataError: missing or damaged.
@@ -136,15 +185,19 @@ class LabelStore:
             pictures = np.load(self._pictures(chunk), mmap_mode="r", allow_pickle=False)
             with np.load(self._points(chunk), allow_pickle=False) as file:
                 points, counts = file["points"], file["counts"]
+                pixels = int(np.prod(pictures.shape[1:]))
+                everything = np.full((len(counts), -(-pixels // 8)), 255, dtype=np.uint8)
+                seen = file["seen"] if "seen" in file else everything
             ends = np.cumsum(counts)
             whole = len(counts) == len(pictures) and int(ends[-1]) == len(points) and pictures.dtype == np.uint8
+            whole = whole and seen.shape == everything.shape and seen.dtype == np.uint8
         except (OSError, ValueError, KeyError, IndexError) as error:
             raise DataError(f"chunk {chunk} of {self.folder} is damaged ({error}): delete the folder") from error
         if not whole:
             raise DataError(
                 f"chunk {chunk} of {self.folder} is damaged (points and pictures differ): delete the folder"
             )
-        return pictures, np.split(points, ends[:-1])
+        return pictures, np.split(points, ends[:-1]), seen
 
     def read(self, count: int | None = None) -> LabelledPictures:
         """All that is there, or the first ``count`` pictures.
@@ -155,15 +208,23 @@ class LabelStore:
         about = self.about()
         pictures: list[Image] = []
         points: list[Array] = []
+        seen: list[NDArray[np.uint8]] = []
         chunk = 0
+        if about["format"] == _OLD_FORMAT:
+            log.warning(
+                "%s does not say where no label could be, near the edges of pictures: there it teaches that there is "
+                "no point; labels made anew do not",
+                self.folder,
+            )
         while self.has(chunk) and (count is None or len(pictures) < count):
-            more, theirs = self.read_chunk(chunk)
+            more, theirs, looked = self.read_chunk(chunk)
             pictures.extend(more)
             points.extend(theirs)
+            seen.extend(looked)
             chunk += 1
         if not pictures or (count is not None and len(pictures) < count):
             raise DataError(f"{self.folder} holds {len(pictures)} labelled pictures, {count or 'some'} are needed")
-        return LabelledPictures(pictures=pictures[:count], points=points[:count], about=about)
+        return LabelledPictures(pictures=pictures[:count], points=points[:count], seen=seen[:count], about=about)
 
     def _pictures(self, chunk: int) -> Path:
         return self.folder / f"pictures-{chunk:04d}.npy"

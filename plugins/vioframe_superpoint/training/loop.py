@@ -4,6 +4,7 @@ A plain loop, not lightning's: a batch is a function of its iteration, so that a
 the weights and the state of the optimizer.
 """
 
+import json
 import logging
 import math
 import os
@@ -36,6 +37,8 @@ StepLoss = Callable[[SuperPointNet, Mapping[str, Tensor], int], dict[str, Tensor
 """(net, batch, iteration) → losses by name, of which ``"loss"`` is minimised."""
 
 _BIASES_BELOW = 2
+# May be changed when a training is resumed.
+_MAY_CHANGE = frozenset({"iterations", "validate_every"})
 
 
 @dataclass(slots=True, kw_only=True)
@@ -69,6 +72,7 @@ class Stage:
         validate: iteration → figures; ``"rank"``, higher is better, chooses among weights.
         keep: called when the weights are the best so far.
         rate_key: the option of the learning rate, for messages.
+        settings: all options that have a bearing on the weights, as plain values; a resumed training has the same.
     """
 
     name: str
@@ -81,6 +85,7 @@ class Stage:
     validate: Callable[[int], Mapping[str, float]]
     keep: Callable[[Progress, Mapping[str, float]], None]
     rate_key: str
+    settings: Mapping[str, object]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -171,9 +176,16 @@ class Loop:
         """Go on from a file that :meth:`run` wrote in this stage.
 
         Raises:
+            ConfigError: it was written with other options.
             DataError: it is of another net.
         """
         content = read_resume(path)
+        differing = differences(content.get("settings", {}), _plain(self._stage.settings))
+        if differing:
+            raise ConfigError(
+                f"trainer.resume={path} was written with other options: {', '.join(differing)}; give those of the run "
+                "that wrote it, or begin anew"
+            )
         try:
             self._net.load_state_dict(content["net"])
             self._optimizer.load_state_dict(content["optimizer"])
@@ -247,6 +259,7 @@ class Loop:
             "seconds": progress.seconds,
             "best": None if progress.best is None else list(progress.best),
             "rows": progress.rows,
+            "settings": _plain(self._stage.settings),
             "net": self._net.state_dict(),
             "optimizer": self._optimizer.state_dict(),
         }
@@ -270,6 +283,23 @@ def read_resume(path: Path) -> dict[str, Any]:
             f"trainer.resume={path} is not a whole resume file of frontend=superpoint: begin anew"
         ) from error
     return dict(content)
+
+
+def differences(stored: Mapping[str, Any], now: Mapping[str, Any], key: str = "frontend.training") -> list[str]:
+    """Options that are not as they were, with both values; those that may change, and what was not stored, left out."""
+    told: list[str] = []
+    for name in sorted(stored.keys() & now.keys() - (_MAY_CHANGE if key == "frontend.training" else frozenset())):
+        was, value = stored[name], now[name]
+        if isinstance(was, Mapping) and isinstance(value, Mapping):
+            told += differences(was, value, f"{key}.{name}")
+        elif was != value:
+            told.append(f"{key}.{name}={value} (it was {was})")
+    return told
+
+
+def _plain(settings: Mapping[str, object]) -> dict[str, Any]:
+    """As a file that is read as data can hold them."""
+    return dict(json.loads(json.dumps(settings)))
 
 
 def _optimizer(net: nn.Module, rate: RateOptions) -> torch.optim.Optimizer:

@@ -23,7 +23,7 @@ def detector_loss(logits: Tensor, classes: Tensor, valid: Tensor) -> Tensor:
     Args:
         logits: (B, 65, h, w).
         classes: (B, h, w) int64, place of the point in its cell (row · 8 + column), or 64 for none.
-        valid: (B, h, w) bool, cells that lie in the picture as a whole.
+        valid: (B, h, w) bool, cells where it is known whether there is one.
     """
     each = F.cross_entropy(logits.float(), classes, reduction="none")
     return (each * valid).sum() / valid.sum().clamp(min=1)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import TypedDict
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +13,8 @@ from vioframe.types import Image
 from vioframe_superpoint.training.labels import cell_classes, whole_cells
 from vioframe_superpoint.training.options import PairOptions
 
-# px, from where a picture ends, within which it teaches nothing: a corner of black is none of the scene.
+# px, from where a picture ends, within which nothing is matched: a corner of black is none of the scene. What labels
+# were not looked for there, adaptation.border_px, is in what was seen.
 _BORDER_PX = 3
 # Tries for points that both views show, as a multiple of those that are wanted.
 _TRIES = 4
@@ -21,22 +23,24 @@ _TRIES = 4
 class Pair(TypedDict):
     """Two views of one picture.
 
-    ``images`` (2, H, W) uint8; ``classes`` (2, h, w) int64 of the cells, 64 for none; ``whole`` (2, h, w) bool, cells
-    that lie in the picture; ``overlap`` (2, h, w) bool, cells that lie in the other view as well; ``H`` (3, 3) float32
-    from pixels of the first to the second; ``points`` (2, N, 2) float32 px, which correspond; ``matched`` (N,) bool,
-    which of these are there.
+    ``images`` (2, H, W) uint8; ``classes`` (2, h, w) int64 of the cells, 64 for none; ``known`` (2, h, w) bool, cells
+    all of which was seen when labels were made; ``overlap`` (2, h, w) bool, cells in the picture and in the other view;
+    ``H`` (3, 3) float32 from pixels of the first to the second; ``points`` (2, N, 2) float32 px, which correspond;
+    ``matched`` (N,) bool, which of these are there.
     """
 
     images: NDArray[np.uint8]
     classes: NDArray[np.int64]
-    whole: Mask
+    known: Mask
     overlap: Mask
     H: NDArray[np.float32]
     points: NDArray[np.float32]
     matched: Mask
 
 
-def make_pair(picture: Image, labels: Array, rng: np.random.Generator, options: PairOptions) -> Pair:
+def make_pair(
+    picture: Image, labels: Array, rng: np.random.Generator, options: PairOptions, seen: Mask | None = None
+) -> Pair:
     """Draw two views of a picture.
 
     The first is a crop at some scale, the second a homography of the first that looks at the whole picture, so that it
@@ -47,6 +51,7 @@ def make_pair(picture: Image, labels: Array, rng: np.random.Generator, options: 
         labels: (P, 2) px.
         rng: generator, which alone decides.
         options: of the views.
+        seen: (H, W), where in the picture labels were looked for; None: everywhere.
     """
     size = (int(options.size_px[0]), int(options.size_px[1]))
     picture_size = (picture.shape[1], picture.shape[0])
@@ -56,13 +61,14 @@ def make_pair(picture: Image, labels: Array, rng: np.random.Generator, options: 
         first = mirror @ first
     H = sample_homography(size, rng, options.homographies)
     views = (first, H @ first)
-    images, classes, whole, masks = [], [], [], []
+    images, classes, known, whole, masks = [], [], [], [], []
     for view in views:
         images.append(change_light(warp_picture(picture, view, size), rng, options.lighting))
         mask = valid_mask(view, picture_size, _BORDER_PX, size)
-        seen = warp_points(labels, view)
-        classes.append(cell_classes(seen[_inside(seen, mask)], size, rng))
+        shown = warp_points(labels, view)
+        classes.append(cell_classes(shown[_inside(shown, mask)], size, rng))
         whole.append(whole_cells(mask))
+        known.append(whole[-1] if seen is None else whole[-1] & whole_cells(_looked_at(seen, view, size)))
         masks.append(mask)
     overlap = [
         whole_cells(valid_mask(np.linalg.inv(H), size, 0)) & whole[0],
@@ -72,12 +78,19 @@ def make_pair(picture: Image, labels: Array, rng: np.random.Generator, options: 
     return {
         "images": np.stack(images),
         "classes": np.stack(classes),
-        "whole": np.stack(whole),
+        "known": np.stack(known),
         "overlap": np.stack(overlap),
         "H": H.astype(np.float32),
         "points": points,
         "matched": matched,
     }
+
+
+def _looked_at(seen: Mask, view: Array, size: tuple[int, int]) -> Mask:
+    """Pixels of a view all of which lie where the picture was seen."""
+    full = np.where(seen, 255, 0).astype(np.uint8)
+    warped: Mask = cv2.warpPerspective(full, view, size, flags=cv2.INTER_LINEAR) == 255
+    return warped
 
 
 def _crop(

@@ -5,7 +5,6 @@ wrote it.
 """
 
 import logging
-import platform
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,16 +12,19 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import torch
+from filelock import FileLock, Timeout
 
 from vioframe import __version__
+from vioframe.errors import ConfigError
 from vioframe.learning.seeding import seed_everything
 from vioframe.learning.weights import load_weights, locate_weights, read_card, save_weights
 from vioframe.tracking import Tracker
 from vioframe_superpoint.net.superpoint import SuperPointNet, make_net
 from vioframe_superpoint.options import Encoder
+from vioframe_superpoint.training.cards import GENERATED, excerpt_of, licence_of, machine_of, made_with
 from vioframe_superpoint.training.data import MakeBatch, PairBatches, ShapeBatches
 from vioframe_superpoint.training.labelling import label_pictures
-from vioframe_superpoint.training.labels import LabelledPictures, LabelStore
+from vioframe_superpoint.training.labels import LabelStore
 from vioframe_superpoint.training.loop import RESUME_FILE, Loop, Progress, Session, Stage, StepLoss, read_resume
 from vioframe_superpoint.training.options import TrainingOptions, plain_values
 from vioframe_superpoint.training.precision import resolve_precision
@@ -35,7 +37,11 @@ log = logging.getLogger(__name__)
 
 SHAPES, JOINT = "shapes", "joint"
 DETECTOR_FILE = "detector.safetensors"
-_LICENCE = "Apache-2.0; learned from generated pictures alone, unless pictures.folder says otherwise"
+"""In a folder of labels: the net that made them."""
+SHAPES_FILE = "shapes.safetensors"
+"""In a run's folder: the same net before the weight of corners is taken back, to which they are far too likely."""
+LOCK_FILE = "lock"
+_CORNER_WEIGHT = "corner_weight"
 
 
 @dataclass(slots=True, eq=False)
@@ -110,9 +116,51 @@ class Training:
             KeyboardInterrupt: the user stopped it.
         """
         self._folder.mkdir(parents=True, exist_ok=True)
-        if not self._store.is_complete and not self._make_labels():
+        if self._store.is_complete:
+            self._tell_what_differs()
+        elif not self._make_labels_alone():
             return None
         return self._train_jointly()
+
+    def _tell_what_differs(self) -> None:
+        """Labels stay as they are, whatever is asked for now."""
+        options, detector = self._options, self._store.about().get("detector", {})
+        differing = self._store.differing(self._asked())
+        if options.detector is not None and detector.get("file") != Path(options.detector).name:
+            differing.append(f"detector ({detector.get('file', 'a first stage')}, not {options.detector})")
+        elif options.detector is None and detector.get("training", plain_values(options.shapes)) != plain_values(
+            options.shapes
+        ):
+            differing.append("shapes")
+        if differing:
+            log.warning("labels in %s stay as they were made, with other %s", self._store.folder, ", ".join(differing))
+
+    def _make_labels_alone(self) -> bool:
+        """Make labels, or wait for another training that makes them; whether they are there."""
+        self._store.folder.mkdir(parents=True, exist_ok=True)
+        lock, until = FileLock(self._store.folder / LOCK_FILE), self._session.until
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            log.info("another training makes the labels in %s: waiting for it", self._store.folder)
+            try:
+                lock.acquire(timeout=-1 if until is None else max(until - time.monotonic(), 0.0))
+            except Timeout:
+                log.info("the time of this session is over before the labels are there")
+                return False
+        try:
+            return self._store.is_complete or self._make_labels()
+        finally:
+            lock.release()
+
+    def _asked(self) -> dict[str, object]:
+        """What the options say of the labels."""
+        options = self._options
+        return {
+            "pictures": plain_values(options.pictures),
+            "adaptation": plain_values(options.adaptation),
+            "seed": options.seed,
+        }
 
     def _make_labels(self) -> bool:
         """The first two stages; whether they are done."""
@@ -122,14 +170,26 @@ class Training:
             key = "frontend.training.detector"
             given = locate_weights(self._options.detector, key)
             load_weights(given, net, key)
-            about = {"file": given.name, **_excerpt(read_card(given))}
+            card = read_card(given)
+            if card.get("stage") == SHAPES and card.get(_CORNER_WEIGHT) != 1.0:
+                raise ConfigError(
+                    f"{key}={self._options.detector} learned with corners weighing "
+                    f"{card.get(_CORNER_WEIGHT, 'more than others')}, and finds far too many: give {DETECTOR_FILE} of "
+                    "a folder of labels, in which that is taken back"
+                )
+            about = {"file": given.name, **excerpt_of(card)}
         else:
             if not detector.exists() and not self._train_on_shapes(net):
                 return False
             load_weights(detector, net, "frontend.training.labels")
-            about = _excerpt(read_card(detector))
-        pictures = self._options.pictures
-        source = picture_source(pictures, self._options.seed)
+            card = read_card(detector)
+            about = excerpt_of(card)
+        source = picture_source(self._options.pictures, self._options.seed)
+        told = {"detector": {"architecture": dict(self._architecture), **about}, **self._asked()}
+        self._store.begin(told)
+        # The third stage begins with it, of this training and of others.
+        if not detector.exists():
+            save_weights(detector, net, card)
         return label_pictures(
             self._store,
             source,
@@ -137,12 +197,7 @@ class Training:
             self._options.adaptation,
             seed=self._options.seed,
             precision=self._session.precision,
-            about={
-                "detector": {"architecture": dict(self._architecture), **about},
-                "pictures": plain_values(pictures),
-                "adaptation": plain_values(self._options.adaptation),
-                "seed": self._options.seed,
-            },
+            about=told,
             until=self._session.until,
             shown=self._session.shown,
         )
@@ -151,7 +206,7 @@ class Training:
         """The first stage; whether it is done."""
         options = self._options.shapes
         validation = ShapesValidation(net.net, options)
-        best = self._folder / "weights" / DETECTOR_FILE
+        best = self._folder / "weights" / SHAPES_FILE
         loss = ShapesLoss(options.corner_weight)
         done = self._fit(
             SHAPES,
@@ -167,26 +222,28 @@ class Training:
             ),
             validation=validation,
             best=best,
-            about={"training": plain_values(options), "seed": self._options.seed},
+            about={
+                "training": plain_values(options),
+                "seed": self._options.seed,
+                _CORNER_WEIGHT: options.corner_weight,
+                "licence": GENERATED,
+            },
             rate_key="frontend.training.shapes.learning_rate",
         )
         if done:
             load_weights(best, net, "the first stage")
             loss.take_back(net.net)
-            save_weights(self._store.folder / DETECTOR_FILE, net, read_card(best))
+            save_weights(self._store.folder / DETECTOR_FILE, net, {**read_card(best), _CORNER_WEIGHT: 1.0})
         return done
 
     def _train_jointly(self) -> Path | None:
         """The third stage; the best weights so far."""
         labelled = self._store.read()
-        held_out = int(labelled.about["pictures"]["held_out"])
-        learned = LabelledPictures(
-            pictures=labelled.pictures[:-held_out], points=labelled.points[:-held_out], about=labelled.about
-        )
+        learned, held_out = labelled.parted(int(labelled.about["pictures"]["held_out"]))
         net = self._new_net()
         start = self._start(net)
         options = self._options
-        pairs = validation_pairs(labelled.pictures[-held_out:], options.pairs.lighting, options.seed)
+        pairs = validation_pairs(held_out.pictures, options.pairs.lighting, options.seed)
         path = self._folder / "weights" / f"superpoint-{self._encoder.name}.safetensors"
         done = self._fit(
             JOINT,
@@ -202,7 +259,12 @@ class Training:
             ),
             validation=PairValidation(net.net, pairs),
             best=path,
-            about={"training": options.settings(), "labels": dict(labelled.about), "start": start},
+            about={
+                "training": {**options.settings(), **made_with(labelled.about)},
+                "labels": dict(labelled.about),
+                "start": start,
+                "licence": licence_of(labelled.about),
+            },
             rate_key="frontend.training.learning_rate",
         )
         if not done:
@@ -252,9 +314,8 @@ class Training:
                 "validation": dict(figures),
                 **about,
                 "precision": self._session.precision,
-                "machine": _machine(self._session.device),
+                "machine": machine_of(self._session.device),
                 "code": {"vioframe": __version__, "torch": torch.__version__},
-                "licence": _LICENCE,
                 "made": datetime.now(UTC).isoformat(timespec="seconds"),
             }
             save_weights(best, net, card)
@@ -270,6 +331,7 @@ class Training:
             validate=validate,
             keep=keep,
             rate_key=rate_key,
+            settings=options.settings(),
         )
         loop = Loop(net.net.to(self._session.device), stage, self._session)
         if self._resume is not None and self._resume[0] == name:
@@ -287,13 +349,3 @@ class Training:
         if curve.exists():
             self._session.tracker.log_file(curve)
         return done
-
-
-def _machine(device: torch.device) -> dict[str, object]:
-    name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or platform.machine()
-    return {"device": device.type, "name": name, "threads": torch.get_num_threads()}
-
-
-def _excerpt(card: Mapping[str, object]) -> dict[str, object]:
-    """What labels should tell of the detector that made them."""
-    return {name: card[name] for name in ("iteration", "hours", "validation", "training", "seed") if name in card}

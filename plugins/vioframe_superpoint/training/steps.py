@@ -57,8 +57,8 @@ class JointLoss:
         pairs = images.shape[0]
         # Both views in one pass, the first ones first.
         logits, maps = net(as_float(images.transpose(0, 1).flatten(0, 1)))
-        classes, whole = batch["classes"], batch["whole"]
-        detectors = [detector_loss(logits[at], classes[:, view], whole[:, view]) for view, at in _views(pairs)]
+        classes, known = batch["classes"], batch["known"]
+        detectors = [detector_loss(logits[at], classes[:, view], known[:, view]) for view, at in _views(pairs)]
         points, overlap = batch["points"], batch["overlap"]
         descriptors = descriptor_loss(
             self._options,

@@ -62,8 +62,9 @@ def test_textures_are_a_function_of_seed_and_index_in_any_order():
     assert not any(np.array_equal(ahead[0], other) for other in ahead[1:])
 
 
-def test_held_out_textures_are_others():
-    usual, held_out = (Textures(size_px=SIZE, count=4, seed=1, held_out=held) for held in (False, True))
+@pytest.mark.parametrize("purpose", ["validation", "held_out"])
+def test_textures_of_another_purpose_are_others(purpose):
+    usual, held_out = (Textures(size_px=SIZE, count=4, seed=1, purpose=each) for each in ("training", purpose))
     for index in range(4):
         assert not np.array_equal(usual.picture(index), held_out.picture(index))
 
@@ -158,7 +159,7 @@ def test_places_are_a_function_of_seed_and_index_and_places_differ():
     np.testing.assert_array_equal(pictures[0], pictures[2])
     assert pictures[0].shape == SIZE[::-1]
     assert np.abs(pictures[0].astype(float) - pictures[1]).mean() > 3.0
-    held_out = RenderedPlaces(size_px=SIZE, count=6, seed=0, each=2, held_out=True)
+    held_out = RenderedPlaces(size_px=SIZE, count=6, seed=0, each=2, purpose="held_out")
     assert np.abs(pictures[0].astype(float) - held_out.picture(2)).mean() > 3.0
 
 

@@ -1,6 +1,7 @@
 """SuperPoint's training: options, labels, pairs, adaptation, and stages that can be stopped and gone on with."""
 
 import json
+import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs torch (extra learn)")
+
+from filelock import FileLock  # noqa: E402
 
 from vioframe.errors import ConfigError, DataError  # noqa: E402
 from vioframe.interfaces import TrainsItself  # noqa: E402
@@ -198,6 +201,62 @@ def test_complete_labels_serve_another_training(whole, tmp_path, monkeypatch):
     assert not (tmp_path / "labels").exists()
 
 
+def test_labels_that_are_there_are_what_the_card_tells_of(whole, tmp_path, caplog):
+    labels = str(whole[0] / "labels")
+    other = replace(OPTIONS, labels=labels, iterations=2, validate_every=2, seed=4)
+    other = replace(
+        other,
+        adaptation=replace(OPTIONS.adaptation, threshold=0.5),
+        shapes=replace(OPTIONS.shapes, iterations=9),
+    )
+    card = read_card(train(tmp_path, other))
+    (told,) = [record.getMessage() for record in caplog.records if "stay as they were made" in record.getMessage()]
+    assert "adaptation" in told and "seed (3, not 4)" in told and "shapes" in told and "pictures" not in told
+    assert card["training"]["adaptation"]["threshold"] == 0.001
+    assert card["training"]["shapes"]["iterations"] == 4
+    assert card["licence"] == "Apache-2.0; learned from generated pictures alone"
+    caplog.clear()
+    train(tmp_path, replace(OPTIONS, labels=labels, iterations=2, validate_every=2))
+    assert "stay as they were made" not in caplog.text
+
+
+def test_detector_that_is_given_labels_and_is_where_the_third_stage_begins(whole, tmp_path):
+    given = replace(OPTIONS, detector=str(whole[0] / "labels" / "detector.safetensors"))
+    weights = train(tmp_path, given)
+    assert read_card(weights)["start"] == "detector.safetensors of the labels"
+    assert not (tmp_path / "shapes.csv").exists()
+    assert_same_training(whole[0], tmp_path)
+
+
+def test_detector_to_which_corners_are_too_likely_is_refused(whole, tmp_path):
+    raw = whole[0] / "weights" / "shapes.safetensors"
+    assert read_card(raw)["corner_weight"] == 8.0
+    with pytest.raises(ConfigError, match=r"frontend\.training\.detector=.* weighing 8\.0.*detector\.safetensors"):
+        train(tmp_path, replace(OPTIONS, detector=str(raw)))
+
+
+def test_only_one_training_at_a_time_makes_labels(whole, tmp_path, monkeypatch):
+    labels = tmp_path / "labels"
+    labels.mkdir()
+    with FileLock(labels / "lock"):
+        hurried = replace(OPTIONS, labels=str(labels), max_minutes=1e-9)
+        assert train(tmp_path / "run", hurried) is None
+    assert {path.name for path in labels.iterdir()} <= {"lock"}
+
+
+def test_resuming_with_other_options_is_refused(whole, tmp_path):
+    shutil.copy(whole[0] / "resume.ckpt", tmp_path)
+    labels = str(whole[0] / "labels")
+    with pytest.raises(ConfigError, match=r"frontend\.training\.batch_size=4 \(it was 2\)"):
+        train(tmp_path, replace(OPTIONS, labels=labels, batch_size=4), resume=True)
+    other = replace(OPTIONS, labels=labels, pairs=replace(PAIRS, matches=12))
+    with pytest.raises(ConfigError, match=r"frontend\.training\.pairs\.matches=12 \(it was 24\)"):
+        train(tmp_path, other, resume=True)
+    more = replace(OPTIONS, labels=labels, iterations=8, save_every=1, workers=0)
+    train(tmp_path, more, resume=True)
+    assert final_state(tmp_path)["iteration"] == 8
+
+
 def test_no_labels_are_mixed_with_others(whole, tmp_path):
     store = LabelStore(whole[0] / "labels")
     about = {name: value for name, value in store.about().items() if name not in ("format", "told")}
@@ -224,7 +283,7 @@ def test_resume_file_of_something_else_is_refused(tmp_path):
 def test_damaged_labels_are_told(whole, tmp_path):
     store = LabelStore(tmp_path)
     store.begin({"seed": 0})
-    store.write(0, [np.zeros((16, 16), dtype=np.uint8)], [np.zeros((3, 2))])
+    store.write(0, [np.zeros((16, 16), dtype=np.uint8)], [np.zeros((3, 2))], [np.ones((16, 16), dtype=bool)])
     (tmp_path / "points-0000.npz").write_bytes(b"PK")
     with pytest.raises(DataError, match="chunk 0 of .* is damaged"):
         store.read()
@@ -294,6 +353,42 @@ def test_labels_of_a_pair_are_where_the_picture_shows_them():
                 assert pair["images"][view][row * 8 + place // 8, column * 8 + place % 8] > 60
 
 
+def test_no_cell_teaches_where_labels_were_not_looked_for():
+    picture = Blocks(1, (160, 120)).picture(0)
+    labels = np.array([[40.0, 40.0], [80.0, 60.0]])
+    seen = np.zeros((120, 160), dtype=bool)
+    seen[:, :100] = True
+    for seed in range(6):
+        usual, partly = (make_pair(picture, labels, np.random.default_rng(seed), PAIRS, each) for each in (None, seen))
+        assert not (partly["known"] & ~usual["known"]).any()
+        # Of the picture with the part that was not seen in white, no cell that teaches shows any of it.
+        marked = np.where(seen, 0, 255).astype(np.uint8)
+        shown = make_pair(marked, labels, np.random.default_rng(seed), PAIRS)["images"]
+        cells = shown.reshape(2, 6, 8, 8, 8).max(axis=(2, 4))
+        assert not cells[partly["known"]].any()
+        # Descriptors may learn there all the same.
+        np.testing.assert_array_equal(partly["overlap"], usual["overlap"])
+        np.testing.assert_array_equal(partly["points"], usual["points"])
+
+
+def test_what_was_seen_is_kept_with_the_labels(whole, tmp_path, caplog):
+    labelled = LabelStore(whole[0] / "labels").read()
+    seen = labelled.seen_in(0)
+    assert seen.shape == (64, 96) and not seen[0].any() and seen[32, 48]
+    store = LabelStore(tmp_path)
+    store.begin({"seed": 0})
+    mask = np.random.default_rng(0).random((16, 24)) < 0.5
+    store.write(0, [np.zeros((16, 24), dtype=np.uint8)], [np.zeros((3, 2))], [mask])
+    np.testing.assert_array_equal(store.read().seen_in(0), mask)
+    # Labels of a release that did not keep it are read, with a warning, but not added to.
+    about = tmp_path / "labels.json"
+    about.write_text(about.read_text().replace("labels-2", "labels-1"))
+    store.read()
+    assert "where no label could be" in caplog.text
+    with pytest.raises(DataError, match="other format"):
+        store.begin({"seed": 0})
+
+
 def test_pairs_are_a_pure_function_of_the_generator():
     picture = Blocks(1, (160, 120)).picture(0)
     labels = np.array([[40.0, 40.0], [80.0, 60.0]])
@@ -319,7 +414,8 @@ def test_adaptation_of_one_view_is_the_detector():
     net = make_net(ENCODER).eval()
     picture = Blocks(1, (64, 48)).picture(0)
     options = replace(OPTIONS.adaptation, homographies=1, border_px=0)
-    heat = adapted_heat(net, picture, np.random.default_rng(0), options)
+    heat, seen = adapted_heat(net, picture, np.random.default_rng(0), options)
+    assert seen.all()
     from vioframe_superpoint.training.adaptation import heat_of
 
     np.testing.assert_allclose(heat, heat_of(net, picture[None])[0], atol=1e-6)
@@ -335,7 +431,8 @@ def test_adaptation_brings_answers_back_to_where_they_are(monkeypatch):
     spots = sum(np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / 4.5) for at in true)
     picture = np.rint(255 * spots).astype(np.uint8)
     options = replace(OPTIONS.adaptation, homographies=30, threshold=0.3)
-    heat = adapted_heat(None, picture, np.random.default_rng(1), options)
+    heat, seen = adapted_heat(None, picture, np.random.default_rng(1), options)
+    assert not seen[0].any() and seen[48, 64] and not heat[~seen].any()
     points = points_of(heat, options)
     assert len(points) == 3
     apart = np.linalg.norm(points[:, None] - true[None], axis=2)
