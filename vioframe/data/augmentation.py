@@ -115,7 +115,7 @@ class Augmentation:
         }
 
     def mirror_only(self) -> "Augmentation":
-        """The same mirroring and nothing else."""
+        """The same mirroring, with sensors as far out of step, and nothing else."""
         return Augmentation(
             reverse=0.0,
             mirror=self._mirror,
@@ -127,6 +127,7 @@ class Augmentation:
             brightness=self._brightness,
             contrast=self._contrast,
             gamma=self._gamma,
+            sensors=self.sensors,
         )
 
     def apply(self, window: TrainingWindow, rng: np.random.Generator) -> TrainingWindow:

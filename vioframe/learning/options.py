@@ -52,7 +52,8 @@ class TrainerOptions:
         resume: file of a run that was stopped; None begins anew.
         augmentation: of the training windows.
         fusion: options that are others where a fuser is trained on what a VO answered.
-        settling: options that are others where a part is trained further by itself on longer windows; empty: none is.
+        settling: options that are others where a part is trained further by itself on longer windows; None or empty:
+            none is.
 
     Raises:
         ConfigError: with the key and its value.
@@ -91,7 +92,7 @@ class TrainerOptions:
     resume: str | None
     augmentation: Augmentation
     fusion: Mapping[str, Any]
-    settling: Mapping[str, Any]
+    settling: Mapping[str, Any] | None
 
     def __post_init__(self) -> None:
         for name, allowed in _CHOICES.items():

@@ -5,13 +5,21 @@ errors add up, learns from long ones, in which the encoder's gradients would cos
 together first, then those with ``settling_pairs`` by themselves, the others staying as they are.
 """
 
+import hashlib
+import logging
+import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from vioframe.data.windows import StoredSequence, WindowIndex
 from vioframe.interfaces import Trainable
+from vioframe.learning.callbacks import RESUME_FILE, ResumePoint
 from vioframe.learning.options import TrainerOptions
+
+log = logging.getLogger(__name__)
 
 FOLDER = "settled"
 """Of this stage's weights and curve, within the run's."""
@@ -25,7 +33,6 @@ def settling_options(
     options: TrainerOptions,
     *,
     pairs: int,
-    folder: Path,
 ) -> TrainerOptions | None:
     """How the parts that wish it are trained further; None where there is none, or no longer window.
 
@@ -35,7 +42,6 @@ def settling_options(
         training, validation: recordings.
         options: of the training before.
         pairs: of the windows of the training before.
-        folder: of the whole run; where it was resumed, this stage is too.
     """
     wished = {slot: int(getattr(parts[slot], "settling_pairs", None) or 0) for slot in trained}
     slots = [slot for slot in trained if wished[slot]]
@@ -45,12 +51,41 @@ def settling_options(
     length = min(max(wished.values()), *longest)
     if length <= pairs:
         return None
-    resume = folder / FOLDER / "resume.ckpt"
     return replace(
         options,
         **{str(name): value for name, value in options.settling.items()},
         train=slots,
         pairs=length,
-        resume=str(resume) if options.resume is not None and resume.is_file() else None,
+        resume=None,
         augmentation=options.augmentation.mirror_only(),
     )
+
+
+def fingerprint(parts: Mapping[str, Trainable]) -> str:
+    """Of all weights that this stage begins with, those that stay as they are included."""
+    digest = hashlib.sha256()
+    for slot, part in parts.items():
+        for name, tensor in part.net.state_dict().items():
+            digest.update(f"{slot}.{name} {tuple(tensor.shape)}".encode())
+            digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
+
+
+def resume_file(folder: Path, start: str) -> str | None:
+    """Where this stage can go on, or None where it has to begin: it did not yet, or with other weights.
+
+    Args:
+        folder: of this stage.
+        start: :func:`fingerprint` of the weights as they are now.
+    """
+    path = folder / RESUME_FILE
+    if not path.is_file():
+        return None
+    try:
+        before = torch.load(path, map_location="cpu", weights_only=True).get(ResumePoint.START)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError):
+        before = None
+    if before == start:
+        return str(path)
+    log.warning("%s is of other weights than those trained since: this stage begins anew", path)
+    return None

@@ -5,10 +5,8 @@ import json
 import logging
 import math
 import pickle
-import signal
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -17,13 +15,12 @@ from typing import Any
 import lightning
 import numpy as np
 import torch
-from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.accelerators import CUDAAccelerator
 from lightning.pytorch.callbacks import Callback
 
 from vioframe import __version__
 from vioframe.data.windows import StoredSequence, WindowIndex
-from vioframe.errors import ConfigError, DataError
+from vioframe.errors import DataError
 from vioframe.interfaces import Trainable
 from vioframe.learning.callbacks import (
     Bar,
@@ -39,10 +36,11 @@ from vioframe.learning.callbacks import (
 from vioframe.learning.datamodule import WindowData
 from vioframe.learning.module import TrainingModule
 from vioframe.learning.options import TrainerOptions
+from vioframe.learning.running import quiet, running, told
 from vioframe.learning.scoring import Score, mean_motion, score_motions
 from vioframe.learning.seeding import seed_everything
 from vioframe.learning.settling import FOLDER as SETTLED
-from vioframe.learning.settling import settling_options
+from vioframe.learning.settling import fingerprint, resume_file, settling_options
 from vioframe.learning.weights import load_weights, read_card
 from vioframe.tracking import Tracker
 
@@ -128,21 +126,41 @@ def train_parts(
         parts, training, validation, options, pairs, folder=folder, tracker=tracker, about=about, shown=shown
     )
     further = settling_options(
-        parts, list(first.weights), training.sequences, validation.sequences, options, pairs=pairs, folder=folder
+        parts, list(first.weights), training.sequences, validation.sequences, options, pairs=pairs
     )
     if further is None:
         return first
+    if first.epochs < options.max_epochs:
+        # It would settle on weights that are not final: those that a resumed run goes on to train.
+        log.warning(
+            "trainer.max_minutes=%s ended the training after %d of trainer.max_epochs=%d epochs: %s is not settled; "
+            "task=train with trainer.resume and more time goes on to it",
+            options.max_minutes,
+            first.epochs,
+            options.max_epochs,
+            ", ".join(further.train or ()),
+        )
+        return first
+    place, start = folder / SETTLED, fingerprint(parts)
+    resume = None if options.resume is None else resume_file(place, start)
+    if resume is None:
+        # What is left there settled on other weights.
+        shutil.rmtree(place / "weights", ignore_errors=True)
     settled = _train_together(
         parts,
         training,
         validation,
-        further,
+        replace(further, resume=resume),
         further.pairs or pairs,
-        folder=folder / SETTLED,
+        folder=place,
         tracker=tracker,
         about=about,
         shown=shown,
+        start=start,
     )
+    if not settled.weights:
+        log.info("no epoch of settling was better than what it began with, which is kept")
+        _load(parts, {slot: first.weights[slot] for slot in further.train or ()})
     return replace(
         settled if settled.weights else first,
         weights={**first.weights, **settled.weights},
@@ -162,8 +180,12 @@ def _train_together(
     tracker: Tracker,
     about: Mapping[str, object],
     shown: bool,
+    start: str | None = None,
 ) -> Trained:
-    """One stage, on windows of ``pairs`` pairs; arguments and errors as of :func:`train_parts`."""
+    """One stage, on windows of ``pairs`` pairs; arguments and errors as of :func:`train_parts`.
+
+    Where ``start`` tells which weights it begins with, only better ones come out.
+    """
     context = max(part.context_pairs for part in parts.values())
     if pairs < context:
         log.warning("trainer.pairs=%d is less than the %d pairs that one answer takes, which are taken", pairs, context)
@@ -190,11 +212,11 @@ def _train_together(
     watchers: list[Callback] = [Bar()] if shown else []
     watchers += [StopDivergence(options.divergence_factor, options.learning_rate), best]
     watchers += [BestPicture(folder, tracker), FlowPicture(folder, tracker)]
-    watchers += [curve, CurvePicture(curve, reference, beside, folder, tracker), ResumePoint(folder)]
+    watchers += [curve, CurvePicture(curve, reference, beside, folder, tracker), ResumePoint(folder, start)]
     folder.mkdir(parents=True, exist_ok=True)
-    trainer = _trainer(options, folder, watchers)
-    _fit(trainer, module, data, options)
-    weights, score = _best(best, trained)
+    to_better = math.inf if start is None else _rank(_trainer(options, folder, []), module, data, options)
+    _fit(_trainer(options, folder, watchers), module, data, options)
+    weights, score = _best(best, trained, to_better)
     return Trained(
         weights=weights, score=score, reference=reference, beside=beside, epochs=len(curve.rows), curve=curve.rows
     )
@@ -243,7 +265,7 @@ def _trainer(options: TrainerOptions, folder: Path, callbacks: list[Callback]) -
         precision = "bf16-mixed"
     if gpu:
         torch.set_float32_matmul_precision("high")
-    with _quiet(), _told(f"trainer.accelerator={options.accelerator}, trainer.devices={options.devices}"):
+    with quiet(), told(f"trainer.accelerator={options.accelerator}, trainer.devices={options.devices}"):
         return lightning.Trainer(
             accelerator=options.accelerator,
             devices=options.devices,
@@ -275,19 +297,10 @@ def _fit(trainer: lightning.Trainer, module: TrainingModule, data: WindowData, o
     resume = None if options.resume is None else Path(options.resume).expanduser()
     if resume is not None and not resume.is_file():
         raise DataError(f"trainer.resume={options.resume}: there is no such file; a run writes resume.ckpt each epoch")
-    before = signal.getsignal(signal.SIGINT)
     try:
-        with _quiet(), _told(f"trainer.max_epochs={options.max_epochs}, trainer.resume={options.resume}"):
+        with running(options), told(f"trainer.max_epochs={options.max_epochs}, trainer.resume={options.resume}"):
             # Weights-only: the file is data, and one that holds anything else is refused.
             trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
-    except SystemExit as error:
-        # Lightning ends the process after Ctrl-C; what it was called from has things to close first.
-        raise KeyboardInterrupt from error
-    except torch.cuda.OutOfMemoryError as error:
-        raise ConfigError(
-            f"trainer.batch_size={options.batch_size} at trainer.size_px={list(options.size_px)} does not fit into the "
-            "memory of the GPU: make one of them smaller"
-        ) from error
     except (pickle.UnpicklingError, EOFError) as error:
         raise DataError(
             f"trainer.resume={options.resume} is not a whole resume file of vioframe: begin anew"
@@ -301,20 +314,31 @@ def _fit(trainer: lightning.Trainer, module: TrainingModule, data: WindowData, o
             f"trainer.resume={options.resume} does not fit these parts or is not whole ({first}): resume with the "
             "configuration of the run that wrote it, or begin anew"
         ) from error
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
-def _best(best: BestWeights, trained: Mapping[str, Trainable]) -> tuple[dict[str, Path], Score | None]:
-    """Files of the best weights, which the parts then have, and their score."""
+def _rank(trainer: lightning.Trainer, module: TrainingModule, data: WindowData, options: TrainerOptions) -> float:
+    """What the parts reach as they are, on the validation windows."""
+    with running(options):
+        trainer.validate(module, datamodule=data, verbose=False)
+    return module.rank_value if math.isfinite(module.rank_value) else math.inf
+
+
+def _load(parts: Mapping[str, Trainable], weights: Mapping[str, Path]) -> None:
+    for slot, path in weights.items():
+        load_weights(path, parts[slot], f"{slot}.weights")
+        parts[slot].net.eval()
+
+
+def _best(
+    best: BestWeights, trained: Mapping[str, Trainable], to_better: float
+) -> tuple[dict[str, Path], Score | None]:
+    """Files of the best weights, which the parts then have, and their score; nothing where none ranks better."""
     weights: dict[str, Path] = {}
     score = None
-    if best.best:
+    if best.best and best.best[0][0] < to_better:
         epoch = best.best[0][1]
         weights = {slot: best.path(slot, epoch) for slot in trained}
-        for slot, part in trained.items():
-            load_weights(weights[slot], part, f"{slot}.weights")
-            part.net.eval()
+        _load(trained, weights)
         figures = read_card(next(iter(weights.values())))["validation"]
         score = Score(**{each.name: figures[each.name] for each in fields(Score)})
     return weights, score
@@ -343,28 +367,3 @@ def _figures(module: TrainingModule, options: TrainerOptions) -> dict[str, objec
     lengths = [float(length) for length in options.segment_lengths_m]
     finite = {name: value if math.isfinite(value) else None for name, value in figures.items()}
     return {"validation": {**finite, "segment_lengths_m": lengths, "protocol": _PROTOCOL}}
-
-
-@contextmanager
-def _told(options: str) -> Iterator[None]:
-    """What lightning finds wrong with the options, as one sentence that names them."""
-    try:
-        yield
-    except MisconfigurationException as error:
-        raise ConfigError(f"{options}: {str(error).strip().splitlines()[0]}") from error
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Lightning tells at length which devices it found and what it would advise; the task says what matters."""
-    chatty = logging.getLogger("lightning.pytorch"), logging.getLogger("lightning.fabric")
-    levels = [logger.level for logger in chatty]
-    for logger in chatty:
-        logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", module=r"lightning\..*")
-            yield
-    finally:
-        for logger, level in zip(chatty, levels, strict=True):
-            logger.setLevel(level)

@@ -161,7 +161,10 @@ class _Stage:
         used = {slot: bearing_of(self.config, slot) for slot in self.together}
         words = [__version__, options.settings(), used, [split.hashes for split in splits]]
         if self.settles:
-            words.append(dict(options.settling))
+            words.append(dict(options.settling or {}))
+            if options.settling and options.augmentation.sensors.active:
+                # What had settled before this word was there had done so with sensors in step.
+                words.append("sensors out of step")
         return hashlib.sha256(json.dumps(words, sort_keys=True, default=str).encode()).hexdigest()
 
     def _train(

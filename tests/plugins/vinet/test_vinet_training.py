@@ -1,6 +1,7 @@
 """Both parts of VINet trained together by the loop of the core, and what comes out used."""
 
 import dataclasses
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,12 +12,16 @@ pytest.importorskip("lightning", reason="needs lightning: pip install 'vioframe[
 
 import torch
 
+from composing import composed
 from learned_parts import options
 from learned_scenes import stored
+from vioframe.build import build, build_pipeline
+from vioframe.data.recording import Dataset
 from vioframe.data.windows import cut_window
 from vioframe.learning.batch import collate
 from vioframe.learning.seeding import seed_everything
 from vioframe.learning.training import Split, train_parts
+from vioframe.tasks.provision import provide_weights
 from vioframe.testing import make_scene
 from vioframe.tracking import NullTracker
 from vioframe.types import Measurement
@@ -44,7 +49,7 @@ def test_both_parts_are_trained_together_then_the_fuser_alone_and_keep_their_wei
         epoch_windows=8,
         size_px=list(SIZE),
         augmentation={"reverse": 0.5, "mirror": 0.5},
-        settling={"max_epochs": 1, "epoch_windows": 4, "batch_size": 2},
+        settling={"max_epochs": 3, "epoch_windows": 12, "batch_size": 2, "learning_rate": 1e-4},
     )
     seed_everything(0)
     splits = (Split(sequences=(small(name),), hashes=(name,)) for name in ("training", "validation"))
@@ -53,7 +58,7 @@ def test_both_parts_are_trained_together_then_the_fuser_alone_and_keep_their_wei
         "frontend": tmp_path.name,
         "fuser": "settled",
     }
-    assert trained.epochs == len(trained.curve) == 3
+    assert trained.epochs == len(trained.curve) == 5
     assert trained.score is not None and np.isfinite(trained.score.t_rel_percent)
     used = parts(**{slot: str(path) for slot, path in trained.weights.items()})
     scene = make_scene()
@@ -66,6 +71,24 @@ def test_both_parts_are_trained_together_then_the_fuser_alone_and_keep_their_wei
         states += used["fuser"].update(Measurement(window=window, features=used["frontend"].process(window.current)))
     assert len(states) == len(scene.frames)
     assert all(np.linalg.eigvalsh(state.covariance).min() > 0.0 for state in states)
+
+
+def test_an_experiment_trains_without_settling_where_it_is_left_out(tmp_path):
+    small = [
+        "frontend.features=8",
+        "frontend.width=0.05",
+        "fuser.window=3",
+        "fuser.hidden=8",
+        "trainer.epoch_windows=4",
+    ]
+    splits = ("train", "validation")
+    recordings = [f"training_data.{split}.{change}" for split in splits for change in ("seed=0", "duration_s=5")]
+    cache = f"trainer.cache={tmp_path}"
+    config = composed("system=vinet", "trainer=smoke", "trainer.settling=null", *small, *recordings, cache)
+    choices = {"frontend": "pair_encoder", "fuser": "vinet"}
+    provide_weights(config, choices, build_pipeline(config, choices), build(config, "dataset", Dataset), shown=False)
+    assert Path(config.fuser.weights).is_file()
+    assert Path(config.fuser.weights).parent == Path(config.frontend.weights).parent
 
 
 def test_a_frozen_encoder_encodes_a_pair_once(tmp_path):

@@ -4,7 +4,7 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import lightning
 from lightning.pytorch.callbacks import Callback
@@ -74,10 +74,26 @@ class BestWeights(Callback):
 
 
 class ResumePoint(Callback):
-    """Writes ``resume.ckpt`` at the end of every epoch; last of the callbacks, so that it holds their states."""
+    """Writes ``resume.ckpt`` at the end of every epoch; last of the callbacks, so that it holds their states.
 
-    def __init__(self, folder: Path) -> None:
+    Args:
+        folder: of the file.
+        start: what the file says of the weights that the training began with; None: nothing.
+    """
+
+    START: ClassVar[str] = "vioframe_start"
+    """Key of ``start`` in the file."""
+
+    def __init__(self, folder: Path, start: str | None = None) -> None:
         self._path = folder / RESUME_FILE
+        self._start = start
+
+    def on_save_checkpoint(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Say what the training began with."""
+        if self._start is not None:
+            checkpoint[self.START] = self._start
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Write beside, then rename: a kill on the way leaves the last one whole."""
