@@ -43,7 +43,7 @@ class HomographyOptions:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.patch_ratio <= 1.0:
-            raise ConfigError(f"patch_ratio of a random homography must lie in (0, 1], got {self.patch_ratio}")
+            raise ConfigError(f"patch_ratio={self.patch_ratio} of HomographyOptions must lie in (0, 1]")
         for name, value, limit in (
             ("perspective", self.perspective, 0.9),
             ("scale", self.scale, 0.9),
@@ -51,7 +51,7 @@ class HomographyOptions:
             ("overflow", self.overflow, 1.0),
         ):
             if not 0.0 <= value <= limit:
-                raise ConfigError(f"{name} of a random homography must lie in [0, {limit:g}], got {value}")
+                raise ConfigError(f"{name}={value} of HomographyOptions must lie in [0, {limit:g}]")
 
 
 def sample_homography(

@@ -90,9 +90,9 @@ class LightingOptions:
         for name in _PROBABILITIES:
             value = getattr(self, name)
             if not 0.0 <= value <= 1.0:
-                raise ConfigError(f"lighting.{name} is a probability and must lie in [0, 1], got {value}")
+                raise ConfigError(f"{name}={value} of LightingOptions is a probability and must lie in [0, 1]")
         strengths = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in _PROBABILITIES}
-        check_not_negative("lighting", **strengths)
+        check_not_negative("LightingOptions", **strengths)
 
     def without_blur(self) -> "LightingOptions":
         """The same light through a perfect lens and shutter."""

@@ -6,7 +6,7 @@ bring a training of its own.
 
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
@@ -100,11 +100,11 @@ def _train_themselves(config: DictConfig, choices: Mapping[str, str]) -> dict[st
 
 def _run_own(parts: Mapping[str, TrainsItself], config: DictConfig, choices: Mapping[str, str], *, shown: bool) -> int:
     """Train parts by their own trainings, one after the other; the exit status."""
+    hydra_config = HydraConfig.get()
+    check_own_training(hydra_config.overrides.task, {slot: choices.get(slot, "") for slot in parts})
     resume = OmegaConf.select(config, "trainer.resume")
-    output = Path(HydraConfig.get().runtime.output_dir)
-    folder = output if resume is None else Path(str(resume)).expanduser().parent
-    if resume is not None and not (folder / RESUME_FILE).is_file():
-        raise DataError(f"trainer.resume={resume}: there is no {RESUME_FILE} in {folder}")
+    output = Path(hydra_config.runtime.output_dir)
+    folder = output if resume is None else folder_to_resume(str(resume))
     tracker = build(config, "tracker", Tracker, choices.get("tracker", ""))
     output.mkdir(parents=True, exist_ok=True)
     (output / "config.yaml").write_text(OmegaConf.to_yaml(config, resolve=True), encoding="utf-8")
@@ -131,6 +131,41 @@ def _run_own(parts: Mapping[str, TrainsItself], config: DictConfig, choices: Map
         if len(weights) < len(parts):
             log.warning("it ended before there were weights; %s", _how_to_go_on(folder))
     return 0
+
+
+def check_own_training(overrides: Sequence[str], parts: Mapping[str, str]) -> None:
+    """Refuse what says how parts are trained on recordings, where they have a training of their own.
+
+    Args:
+        overrides: of the command line.
+        parts: that have, as they were chosen, by slot.
+
+    Raises:
+        ConfigError: with the first that would do nothing.
+    """
+    for override in overrides:
+        key = override.partition("=")[0].lstrip("+~")
+        group = key.partition(".")[0].partition("@")[0]
+        if group in ("trainer", "training_data") and key not in ("trainer.train", "trainer.resume"):
+            slot, choice = next(iter(parts.items()))
+            raise ConfigError(
+                f"{override} would do nothing: {slot}={choice} has a training of its own, of trainer it reads train "
+                f"and resume alone; its options are those of {slot} (task=train {slot}={choice} --cfg job shows them)"
+            )
+
+
+def folder_to_resume(resume: str) -> Path:
+    """The folder of a training of its own that ``trainer.resume`` names by its file.
+
+    Raises:
+        DataError: there is none.
+    """
+    path = Path(resume).expanduser()
+    if path.name != RESUME_FILE:
+        raise DataError(f"trainer.resume={resume}: give the {RESUME_FILE} of the folder of a training")
+    if not path.is_file():
+        raise DataError(f"trainer.resume={resume}: there is no {RESUME_FILE} in {path.parent}")
+    return path.parent
 
 
 def _how_to_go_on(folder: Path) -> str:

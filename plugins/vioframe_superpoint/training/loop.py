@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from vioframe.errors import ConfigError, DataError
-from vioframe.learning.callbacks.curve import Row, write_rows
+from vioframe.learning.rows import Row, write_rows
 from vioframe.tracking import Tracker
 from vioframe_superpoint.net.superpoint import SuperPointNet
 from vioframe_superpoint.training.bar import Bar

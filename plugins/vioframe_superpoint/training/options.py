@@ -28,8 +28,9 @@ class DescriptorLoss:
         for each in fields(self):
             value = getattr(self, each.name)
             check_not_negative("descriptor_loss", **{each.name: value})
-        if getattr(self, "negatives", 1) < 1:
-            raise ConfigError("descriptor_loss.negatives must be 1 or more")
+        negatives = getattr(self, "negatives", 1)
+        if negatives < 1:
+            raise ConfigError(f"descriptor_loss.negatives must be 1 or more, got {negatives}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

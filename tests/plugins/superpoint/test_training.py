@@ -1,22 +1,27 @@
 """SuperPoint's training: options, labels, pairs, adaptation, and stages that can be stopped and gone on with."""
 
 import json
+import re
 import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs torch (extra learn)")
 
 from filelock import FileLock  # noqa: E402
+from omegaconf import OmegaConf  # noqa: E402
 
+import vioframe_superpoint  # noqa: E402
 from vioframe.errors import ConfigError, DataError  # noqa: E402
 from vioframe.interfaces import TrainsItself  # noqa: E402
 from vioframe.learning.weights import read_card  # noqa: E402
 from vioframe.pictures import HomographyOptions, LightingOptions, warp_points  # noqa: E402
+from vioframe.tasks.train import check_own_training, folder_to_resume  # noqa: E402
 from vioframe.tracking import NullTracker  # noqa: E402
 from vioframe_superpoint.net.superpoint import make_net  # noqa: E402
 from vioframe_superpoint.options import Encoder  # noqa: E402
@@ -296,6 +301,12 @@ def test_options_name_what_is_wrong():
         replace(OPTIONS, schedule="linear")
     with pytest.raises(ConfigError, match=r"pairs\.size_px must be .* multiples of 8"):
         replace(PAIRS, size_px=[100, 48])
+    with pytest.raises(ConfigError, match=r"descriptor_loss\.negatives must be 1 or more, got 0"):
+        replace(OPTIONS.descriptor_loss, negatives=0)
+    with pytest.raises(ConfigError, match=r"patch_ratio=1\.5 of HomographyOptions must lie in \(0, 1\]"):
+        HomographyOptions(patch_ratio=1.5)
+    with pytest.raises(ConfigError, match=r"shadow=2 of LightingOptions is a probability"):
+        LightingOptions(shadow=2)
     with pytest.raises(ConfigError, match=r"frontend\.training\.iterations must be positive"):
         replace(OPTIONS, iterations=0)
 
@@ -489,13 +500,17 @@ SMALL = [
     "frontend.training.shapes.size_px=[64,48]",
     "frontend.training.pictures.count=2",
     "frontend.training.pictures.held_out=1",
-    "frontend.training.pictures.places=0.0",
+    "frontend.training.pictures.folder=images",
     "frontend.training.pictures.size_px=[96,64]",
     "frontend.training.adaptation.homographies=2",
 ]
 
 
 def test_a_user_trains_stops_and_goes_on(cli, tmp_path):
+    # Of a folder: textures take seconds to paint.
+    (tmp_path / "images").mkdir()
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / "images" / f"{number}.png"), Blocks(3).picture(number))
     done = cli(*SMALL, "hydra.run.dir=one", "frontend.training.max_minutes=1e-9")
     assert done.returncode == 0, done.stderr
     assert "go on with trainer.resume=" in done.stdout + done.stderr
@@ -503,11 +518,38 @@ def test_a_user_trains_stops_and_goes_on(cli, tmp_path):
     assert resumed.returncode == 0, resumed.stderr
     assert "frontend.weights=" in resumed.stdout + resumed.stderr
     weights = tmp_path / "one" / "weights" / "superpoint-mobilenetv2.safetensors"
-    assert read_card(weights)["iterations"] == 4
+    card = read_card(weights)
+    assert card["iterations"] == 4
+    assert card["licence"] == "what the pictures of images, from which it learned, allow"
 
 
-def test_resume_without_a_file_is_one_sentence(cli):
-    done = cli(*SMALL, "trainer.resume=nowhere/resume.ckpt")
-    assert done.returncode != 0
-    assert "there is no resume.ckpt in nowhere" in done.stdout + done.stderr
-    assert "Traceback" not in done.stderr
+def test_what_to_resume_is_a_file_of_that_name_that_is_there(tmp_path):
+    with pytest.raises(DataError, match=r"nowhere/resume\.ckpt: there is no resume\.ckpt in nowhere"):
+        folder_to_resume("nowhere/resume.ckpt")
+    (tmp_path / "resume.ckpt").touch()
+    (tmp_path / "other.ckpt").touch()
+    assert folder_to_resume(str(tmp_path / "resume.ckpt")) == tmp_path
+    with pytest.raises(DataError, match=r"other\.ckpt: give the resume\.ckpt"):
+        folder_to_resume(str(tmp_path / "other.ckpt"))
+
+
+def test_options_of_another_training_are_refused():
+    parts = {"frontend": "superpoint"}
+    check_own_training([*SMALL, "trainer.resume=one/resume.ckpt", "++trainer.train=[frontend]"], parts)
+    for override in ("trainer.max_minutes=60", "+trainer.max_epochs=3", "trainer=cpu", "training_data=kitti"):
+        with pytest.raises(ConfigError, match=f"{re.escape(override)} would do nothing: frontend=superpoint has a"):
+            check_own_training([*SMALL, override], parts)
+
+
+def test_options_spelled_out_for_lack_of_a_choice_are_those_of_the_choice():
+    # encoder= and descriptor_loss= stand earlier in the configuration than the front end, so it cannot bring them: they
+    # are also accepted beside a system that has another.
+    conf = Path(vioframe_superpoint.__file__).parent / "conf"
+    front = OmegaConf.create({"frontend": OmegaConf.load(conf / "frontend" / "superpoint.yaml")}).frontend
+    for group, option, value in (
+        ("encoder", "mobilenetv2", front.encoder),
+        ("descriptor_loss", "sparse_triplet", front.training.descriptor_loss),
+    ):
+        chosen = OmegaConf.to_container(OmegaConf.load(conf / group / f"{option}.yaml"))
+        chosen.pop("defaults", None)
+        assert OmegaConf.to_container(value) == chosen

@@ -5,10 +5,11 @@ Their order matters: see ``training.py``.
 """
 
 from vioframe.learning.callbacks.bar import Bar
-from vioframe.learning.callbacks.curve import CURVE_FILE, Curve, Row
+from vioframe.learning.callbacks.curve import CURVE_FILE, Curve
 from vioframe.learning.callbacks.divergence import StopDivergence
 from vioframe.learning.callbacks.drawing import BestPicture, CurvePicture, FlowPicture
 from vioframe.learning.callbacks.keeping import RESUME_FILE, BestWeights, ResumePoint
+from vioframe.learning.rows import Row
 
 __all__ = [
     "CURVE_FILE",

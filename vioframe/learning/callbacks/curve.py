@@ -1,6 +1,5 @@
 """The numbers of a training, an epoch a row: on disk and in the tracker."""
 
-import csv
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,11 +11,10 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
 from vioframe.learning.module import TrainingModule
+from vioframe.learning.rows import Row, write_rows
 from vioframe.tracking import Tracker
 
 CURVE_FILE = "curve.csv"
-
-Row = dict[str, float]
 
 
 class Curve(Callback):
@@ -102,12 +100,3 @@ class Curve(Callback):
             total, count = self._sums.get(f"{split}/{name}", (torch.zeros((), device=value.device), 0))
             # Kept on the device: asking for its value at every step would make the GPU wait.
             self._sums[f"{split}/{name}"] = (total + value.detach().float(), count + 1)
-
-
-def write_rows(path: Path, rows: list[Row]) -> None:
-    """A CSV file of rows that need not have the same columns."""
-    columns = list(dict.fromkeys(name for row in rows for name in row))
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerows({name: f"{value:.10g}" for name, value in row.items()} for row in rows)
