@@ -72,22 +72,15 @@ class SiftFrontend(DescriptorFrontend):
         check_positive(
             "frontend",
             min_depth=min_depth,
-            max_points=max_points,
-            min_distance_px=min_distance_px,
             spacing_px=spacing_px,
             contrast=contrast,
             layers=layers,
             sigma=sigma,
-            search_px=search_px,
-            blind_search_px=blind_search_px,
-            memory_images=memory_images,
-            outlier_px=outlier_px,
             border_px=border_px,
         )
         _require("keypoints", keypoints, keypoints >= max_points, f"at least max_points={max_points}")
         _require("edge", edge, edge > 1.0, "above 1")
         _require("max_distance", max_distance, 0.0 < max_distance <= 2.0, "above 0 and at most 2")
-        _require("ratio", ratio, 0.0 < ratio <= 1.0, "above 0 and at most 1")
         super().__init__(
             name="sift",
             extractor=SiftExtractor(

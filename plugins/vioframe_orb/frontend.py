@@ -67,19 +67,12 @@ class OrbFrontend(DescriptorFrontend):
         border_px: int = 16,
     ) -> None:
         _require("min_depth", min_depth, min_depth > 0.0, "positive")
-        _require("max_points", max_points, max_points >= 1, "at least 1")
-        _require("min_distance_px", min_distance_px, min_distance_px >= 2.0, "at least 2")
         _require("keypoints", keypoints, keypoints >= max_points, f"at least max_points={max_points}")
         _require("spacing_px", spacing_px, spacing_px >= 2.0, "at least 2")
         _require("quality", quality, 0.0 < quality < 1.0, "between 0 and 1")
         _require("min_gradient", min_gradient, min_gradient >= 0.0, "not negative")
         _require("subpixel_px", subpixel_px, 0 <= subpixel_px <= 20, "from 0 to 20")
-        _require("search_px", search_px, search_px > 0.0, "positive")
-        _require("blind_search_px", blind_search_px, blind_search_px > 0.0, "positive")
-        _require("memory_images", memory_images, memory_images >= 1, "at least 1")
         _require("max_distance_bits", max_distance_bits, 1 <= max_distance_bits <= 256, "from 1 to 256")
-        _require("ratio", ratio, 0.0 < ratio <= 1.0, "above 0 and at most 1")
-        _require("outlier_px", outlier_px, outlier_px > 0.0, "positive")
         _require("border_px", border_px, border_px >= 1, "at least 1")
         super().__init__(
             name="orb",

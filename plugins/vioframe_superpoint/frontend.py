@@ -95,15 +95,8 @@ class SuperPointFrontend(DescriptorFrontend):
         training: TrainingOptions | None = None,
     ) -> None:
         _require("min_depth", min_depth, min_depth > 0.0, "positive")
-        _require("max_points", max_points, max_points >= 1, "at least 1")
-        _require("min_distance_px", min_distance_px, min_distance_px >= 2.0, "at least 2")
         _require("keypoints", keypoints, keypoints >= max_points, f"at least max_points={max_points}")
-        _require("search_px", search_px, search_px > 0.0, "positive")
-        _require("blind_search_px", blind_search_px, blind_search_px > 0.0, "positive")
-        _require("memory_images", memory_images, memory_images >= 1, "at least 1")
         _require("max_distance", max_distance, 0.0 < max_distance <= 2.0, "above 0 and at most 2")
-        _require("ratio", ratio, 0.0 < ratio <= 1.0, "above 0 and at most 1")
-        _require("outlier_px", outlier_px, outlier_px > 0.0, "positive")
         _require("border_px", border_px, border_px >= 1, "at least 1")
         self._superpoint = SuperPointExtractor(
             encoder=encoder,

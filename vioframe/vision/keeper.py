@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vioframe.checks import Array, Stamps
+from vioframe.checks import Array, Stamps, check_positive
+from vioframe.errors import ConfigError
 from vioframe.geometry import camera as projection
 from vioframe.types import Camera
 from vioframe.vision.keypoints import Keypoints
@@ -31,6 +32,9 @@ class KeeperOptions:
         ratio: to the second nearest descriptor.
         reject_outliers: by epipolar geometry.
         outlier_px: distance from the epipolar line that contradicts it.
+
+    Raises:
+        ConfigError: an option outside its range, by its name in the config of a front end.
     """
 
     max_points: int
@@ -42,6 +46,19 @@ class KeeperOptions:
     ratio: float
     reject_outliers: bool
     outlier_px: float
+
+    def __post_init__(self) -> None:
+        check_positive(
+            "frontend",
+            search_px=self.search_px,
+            blind_search_px=self.blind_search_px,
+            outlier_px=self.outlier_px,
+        )
+        for name, least in (("max_points", 1), ("min_distance_px", 2), ("memory_images", 1)):
+            if not getattr(self, name) >= least:
+                raise ConfigError(f"frontend.{name} must be at least {least}, got {getattr(self, name)}")
+        if not 0.0 < self.ratio <= 1.0:
+            raise ConfigError(f"frontend.ratio must be above 0 and at most 1, got {self.ratio}")
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
