@@ -10,6 +10,7 @@ from vioframe.errors import ClockError, ConfigError, ShapeError
 Array = npt.NDArray[np.floating]
 Stamps = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
+Image = np.ndarray
 
 
 def check_array(

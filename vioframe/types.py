@@ -6,17 +6,16 @@ is not a field of any of these, so that no estimator can read it by accident.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
+from vioframe import checks
 from vioframe.checks import Array, Stamps, check_array, check_increasing, check_pose
 from vioframe.errors import ShapeError
+from vioframe.vision.keypoints import Keypoints
 
-if TYPE_CHECKING:
-    from vioframe.vision.keypoints import Keypoints
-
-Image = np.ndarray
+Image = checks.Image
 Status = Literal["starting", "tracking", "lost"]
 
 
@@ -271,7 +270,7 @@ class VisualFeatures:
     stereo: Tracks | None = None
     flow: Array | None = None
     embedding: Array | None = None
-    untracked: "Keypoints | None" = None
+    untracked: Keypoints | None = None
     extras: Mapping[str, object] = field(default_factory=dict)
 
 

@@ -5,9 +5,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from vioframe.checks import Array, check_array
+from vioframe.checks import Array, Image, check_array
 from vioframe.errors import ShapeError
-from vioframe.types import Image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
