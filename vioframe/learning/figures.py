@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from vioframe.conventions import NANOSECONDS
 from vioframe.errors import VioframeError
-from vioframe.interfaces import FLOW, Trainable
+from vioframe.interfaces import FLOW, HasNet, Trainable
 
 if TYPE_CHECKING:
     import torch
@@ -38,20 +38,23 @@ def model_figures(parts: Mapping[str, object], size_px: tuple[int, int] | None =
         ``"parameters"`` and ``"gmac"`` of all together, and ``"<slot>.parameters"`` and ``"<slot>.gmac"`` of each.
         GMAC: 1e9 multiply-accumulates of convolutions, linear and LSTM layers for one more image, as
         :mod:`vioframe.learning.counting` has them. There is none of a part with layers that cannot be counted, such as
-        an unrolled solver, or that refuses a blank batch. Empty where no part has a net.
+        an unrolled solver, that refuses a blank batch, or that is trained on something else than windows of a
+        recording. Empty where no part has a net.
     """
-    trainable = {slot: part for slot, part in parts.items() if isinstance(part, Trainable)}
-    if not trainable:
+    nets = {slot: part for slot, part in parts.items() if isinstance(part, HasNet)}
+    if not nets:
         return {}
     from vioframe.learning.counting import parameters_of
 
     figures: dict[str, float] = {}
     known: dict[str, Tensor] = {}
-    for slot, part in trainable.items():
+    for slot, part in nets.items():
         count = parameters_of(part.net)
         if count == 0:
             continue
         figures[f"{slot}.parameters"] = float(count)
+        if not isinstance(part, Trainable):
+            continue
         macs = _macs_of_one_more(part, slot, size_px or _SIZE_PX, known)
         if macs is not None:
             figures[f"{slot}.gmac"] = macs / 1e9

@@ -11,6 +11,8 @@ import torch
 from composing import composed
 from vioframe.errors import ConfigError, DataError
 from vioframe.interfaces import Trainable
+from vioframe.learning.figures import model_figures
+from vioframe.tasks.model_card import model_card
 from vioframe.testing import make_scene
 from vioframe.types import Frame
 from vioframe_superpoint import Encoder, SuperPointFrontend
@@ -45,6 +47,17 @@ def test_many_frames_are_the_same_as_one_by_one(scene, stereo):
             for field in ("ids", "pixels", "bearings", "scores", "descriptors"):
                 if a is not None and hasattr(a, field):
                     assert np.array_equal(getattr(a, field), getattr(b, field)), (kind, field)
+
+
+def test_its_net_is_weighed(scene):
+    part = frontend("vgg")
+    card = model_card(part, "frontend=superpoint")
+    assert model_figures({"frontend": part}) == {"frontend.parameters": card.parameters, "parameters": card.parameters}
+    # Of a copy with normalisation folded in, which layers of the net itself do not see: the first layer alone costs
+    # 9 multiplications for each of 16 channels of each pixel.
+    height, width = scene.frames[0].images[0].shape[:2]
+    assert card.macs > 9 * 16 * height * width
+    assert not card.uncounted and 0.0 < card.answer_ms < 5000.0
 
 
 def test_points_are_followed_or_not_but_never_both(scene):
