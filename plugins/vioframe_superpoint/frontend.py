@@ -45,6 +45,7 @@ class SuperPointFrontend(DescriptorFrontend):
         anchor_steps: to align the patch, an image.
         anchor_reach_px: largest distance of the aligned point from where it was found.
         min_correlation: of the patch that a point began with and what is seen now.
+        follow_missed: look by its patch for a point that no keypoint matched.
         search_px: how far from where the gyro's rotation puts it a point is looked for.
         blind_search_px: the same where there is no gyro.
         memory_images: for how many images an absent point is remembered.
@@ -83,6 +84,7 @@ class SuperPointFrontend(DescriptorFrontend):
         anchor_steps: int = 3,
         anchor_reach_px: float = 2.0,
         min_correlation: float = 0.8,
+        follow_missed: bool = True,
         search_px: float = 15.0,
         blind_search_px: float = 80.0,
         memory_images: int = 5,
@@ -138,6 +140,7 @@ class SuperPointFrontend(DescriptorFrontend):
                 reach_px=anchor_reach_px,
                 min_correlation=min_correlation,
                 memory_images=memory_images,
+                follow=follow_missed,
             ),
         )
 

@@ -8,7 +8,8 @@ from vioframe.types import Image
 
 # Standard deviation of the weight of a patch's pixels, in half sides: the middle counts most.
 _WEIGHT_SPREAD = 0.6
-_SMALLEST = 1e-6
+# Variance of a patch below which it is noise of rounding to whole grey levels, (grey levels)².
+_FLAT = 1.0 / 12.0
 # Added to the diagonal of the normal equations, (grey levels)²: a patch without texture then does not move.
 _DAMPING = 1e-3
 
@@ -120,7 +121,7 @@ class Anchors:
     def _contrast(self, patch: np.ndarray) -> np.ndarray:
         """Root of the weighted variance (K,) of patches (K, side²)."""
         mean = patch @ self._weight
-        contrast: np.ndarray = np.sqrt(np.maximum((patch * patch) @ self._weight - mean * mean, _SMALLEST))
+        contrast: np.ndarray = np.sqrt(np.maximum((patch * patch) @ self._weight - mean * mean, _FLAT))
         return contrast
 
     def _cut(self, image: Image, pixels: Array) -> tuple[np.ndarray, np.ndarray]:
@@ -132,7 +133,7 @@ class Anchors:
         along_y = 0.5 * (wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]).reshape(count, -1)
         template = wide[:, 1:-1, 1:-1].reshape(count, -1)
         template = template - (template @ weight)[:, None]
-        contrast = np.sqrt(np.maximum((template * template) @ weight, _SMALLEST))
+        contrast = np.sqrt(np.maximum((template * template) @ weight, _FLAT))
         template /= contrast[:, None]
         x, y = self._grid
         slopes = np.stack([along_x * x, along_x * y, along_y * x, along_y * y, along_x, along_y], axis=1)

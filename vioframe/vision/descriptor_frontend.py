@@ -5,13 +5,13 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 
-from vioframe.checks import Array
+from vioframe.checks import Array, Mask, Stamps
 from vioframe.errors import DataError, StateError
 from vioframe.geometry import camera as projection
 from vioframe.interfaces import IMAGES, STEREO, STEREO_TRACKS, TRACKS, Frontend
 from vioframe.types import Camera, Frame, Image, SensorRig, Tracks, VisualFeatures
 from vioframe.vision.gray import gray_image, normalise_exposure
-from vioframe.vision.keeper import KeeperOptions, TrackKeeper
+from vioframe.vision.keeper import Follow, KeeperOptions, TrackKeeper
 from vioframe.vision.keypoints import Extractor, Keypoints
 from vioframe.vision.matching import match
 from vioframe.vision.placing import AnchoredPlaces, AnchorOptions
@@ -130,33 +130,43 @@ class DescriptorFrontend(Frontend):
             R_prev_cur: as of :meth:`process`.
         """
         camera = self._calibrated()
-        bearings = projection.bearings(camera, keypoints[0].pixels)
         R_cam = None
         if R_prev_cur is not None:
             R_body_cam = camera.T_body_cam[:3, :3]
             R_cam = R_body_cam.T @ R_prev_cur @ R_body_cam
-        ids, index, ages = self._keeper.keep(keypoints[0], bearings, R_cam)
-        pixels, bearings = keypoints[0].pixels[index], bearings[index]
+        kept = self._keeper.keep(keypoints[0], R_cam, self._follower(grays[0]))
+        pixels = kept.points.pixels
         if self._places is not None:
-            pixels, slipped = self._places.place(grays[0], ids, pixels)
-            self._keeper.forget(ids[slipped])
-            ids, index, ages, pixels = ids[~slipped], index[~slipped], ages[~slipped], pixels[~slipped]
-            bearings = projection.bearings(camera, pixels)
-        self._lost_all += self._points > 0 and not (ages > 1).any()
-        self._points = len(ids)
-        points = keypoints[0].select(index)
+            pixels, slipped = self._places.place(grays[0], kept.ids, pixels)
+            self._keeper.forget(kept.ids[slipped])
+            kept, pixels = kept.select(~slipped), pixels[~slipped]
+        self._lost_all += self._points > 0 and not (kept.ages > 1).any()
+        self._points = len(kept.ids)
         tracks = Tracks(
-            ids=ids,
+            ids=kept.ids,
             pixels=pixels,
-            bearings=bearings,
-            scores=ages.astype(float),
-            descriptors=points.descriptors,
+            bearings=projection.bearings(camera, pixels),
+            scores=kept.ages.astype(float),
+            descriptors=kept.points.descriptors,
         )
         stereo = None
         if self._pair is not None:
-            stereo = self._match_stereo(tracks, self._pair, points, keypoints[1], grays[1])
-        rest = np.setdiff1d(np.arange(len(keypoints[0])), index)
+            stereo = self._match_stereo(tracks, self._pair, kept.points, keypoints[1], grays[1])
+        rest = np.setdiff1d(np.arange(len(keypoints[0])), kept.index)
         return VisualFeatures(frame=frame, tracks=tracks, stereo=stereo, untracked=keypoints[0].select(rest))
+
+    def _follower(self, gray: Image) -> Follow | None:
+        """What looks in an image for points that no keypoint matches."""
+        places, mask = self._places, self.masks[0]
+        if places is None or not self._anchors.follow:
+            return None
+
+        def follow(ids: Stamps, expected: Array) -> tuple[Array, Mask]:
+            pixels, found = places.follow(gray, ids, expected)
+            column, row = np.clip(np.rint(pixels).astype(int), 0, np.array(mask.shape[::-1]) - 1).T
+            return pixels, found & (mask[row, column] != 0)
+
+        return follow
 
     def _calibrated(self) -> Camera:
         if self._camera is None:

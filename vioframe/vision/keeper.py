@@ -1,11 +1,12 @@
 """Lasting ids for points that are found anew in every image."""
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from vioframe.checks import Array, Stamps, check_positive
+from vioframe.checks import Array, Mask, Stamps, check_positive
 from vioframe.errors import ConfigError
 from vioframe.geometry import camera as projection
 from vioframe.types import Camera
@@ -61,6 +62,31 @@ class KeeperOptions:
             raise ConfigError(f"frontend.ratio must be above 0 and at most 1, got {self.ratio}")
 
 
+Follow = Callable[[Stamps, Array], tuple[Array, Mask]]
+"""Takes ids (M,) of points and where they may be (M, 2) px; returns where they are (M, 2) and which were found (M,)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Kept:
+    """The points of an image that have ids.
+
+    Attributes:
+        ids: (M,) ascending.
+        points: M of them; those that were followed have the descriptor by which they were last known, and score 0.
+        ages: (M,) in how many images each was seen.
+        index: (M,) which of the image's keypoints they are; -1 where a point was followed.
+    """
+
+    ids: Stamps
+    points: Keypoints
+    ages: np.ndarray
+    index: np.ndarray
+
+    def select(self, keep: np.ndarray) -> "Kept":
+        """Only these."""
+        return Kept(ids=self.ids[keep], points=self.points.select(keep), ages=self.ages[keep], index=self.index[keep])
+
+
 @dataclass(slots=True, kw_only=True, eq=False)
 class _Seen:
     """An image of the past: ids (M,) ascending, rays (M, 3), and the camera's rotation since (3, 3)."""
@@ -98,32 +124,37 @@ class TrackKeeper:
         self._descriptors: np.ndarray = np.zeros((0, 0), np.uint8)
         self._past: deque[_Seen] = deque(maxlen=options.memory_images)
 
-    def keep(
-        self, keypoints: Keypoints, bearings: Array, R_prev_cur: Array | None
-    ) -> tuple[Stamps, np.ndarray, np.ndarray]:
+    def keep(self, keypoints: Keypoints, R_prev_cur: Array | None, follow: Follow | None = None) -> Kept:
         """Take the next image.
 
         Args:
             keypoints: K of it.
-            bearings: (K, 3) of them.
             R_prev_cur: (3, 3) rotation of the camera since the image before, by the gyro, or None.
-
-        Returns:
-            ids (M,) ascending, which keypoints (M,) they are, and in how many images each was seen (M,).
+            follow: finds points that no keypoint matches; without it they are absent.
         """
         for image in self._past:
             image.R_then_now = image.R_then_now @ (np.eye(3) if R_prev_cur is None else R_prev_cur)
-        known, found = self._find(keypoints, R_prev_cur is not None)
-        if self._options.reject_outliers and len(known):
-            agree = self._agreeing(known, bearings[found], R_prev_cur is not None)
-            known, found = known[agree], found[agree]
-        fresh = self._choose_new(keypoints, found)
-        self._remember(keypoints, bearings, known, found, fresh)
+        gyro = R_prev_cur is not None
+        expected, visible = self._expect()
+        known, index = self._find(keypoints, expected, visible, gyro=gyro)
+        agree = self._agreeing(known, keypoints.pixels[index], gyro=gyro)
+        known, index = known[agree], index[agree]
+        points = keypoints.select(index)
+        if follow is not None:
+            missed = np.setdiff1d(np.flatnonzero(visible), known)
+            followed, pixels = self._follow(follow, missed, expected[missed], known, points.pixels, gyro=gyro)
+            order = np.argsort(np.concatenate([known, followed]))
+            unmatched = Keypoints(pixels=pixels, scores=np.zeros(len(pixels)), descriptors=self._descriptors[followed])
+            known = np.concatenate([known, followed])[order]
+            index = np.concatenate([index, np.full(len(followed), -1)])[order]
+            points = points.join(unmatched).select(order) if len(followed) else points
+        fresh = self._choose_new(keypoints, index[index >= 0], points.pixels)
+        points = points.join(keypoints.select(fresh))
+        self._remember(points, known)
         self._images += 1
         here = np.flatnonzero(self._absent == 0)
-        index = np.concatenate([found, fresh])
         self._past.appendleft(_Seen(ids=self._ids[here], bearings=self._bearings[here], R_then_now=np.eye(3)))
-        return self._ids[here], index, self._ages[here]
+        return Kept(ids=self._ids[here], points=points, ages=self._ages[here], index=np.concatenate([index, fresh]))
 
     def forget(self, ids: Stamps) -> None:
         """Do not look for these points again."""
@@ -132,12 +163,19 @@ class TrackKeeper:
         self._bearings, self._drift = self._bearings[keep], self._drift[keep]
         self._descriptors = self._descriptors[keep]
 
-    def _find(self, keypoints: Keypoints, gyro: bool) -> tuple[np.ndarray, np.ndarray]:
+    def _expect(self) -> tuple[Array, Mask]:
+        """Where everything remembered should be now (M, 2) px, and whether in the image (M,)."""
+        if len(self._ids) == 0:
+            return np.zeros((0, 2)), np.zeros(0, dtype=bool)
+        expected, visible = projection.project(self._camera, self._turned())
+        return expected + self._drifts(expected) * (1.0 + self._absent)[:, None], visible
+
+    def _find(
+        self, keypoints: Keypoints, expected: Array, visible: Mask, *, gyro: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Rows of the memory, ascending, and the keypoints that match them."""
         if len(self._ids) == 0 or len(keypoints) == 0:
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-        expected, visible = projection.project(self._camera, self._turned())
-        expected = expected + self._drifts(expected) * (1.0 + self._absent)[:, None]
         reach = self._options.search_px if gyro else self._options.blind_search_px
         radius = np.where(visible, reach * np.sqrt(1.0 + self._absent), 0.0)
         rows, columns = pairs_near(np.where(visible[:, None], expected, -1e4), keypoints.pixels, radius)
@@ -149,6 +187,29 @@ class TrackKeeper:
             max_distance=self._options.max_distance,
             ratio=self._options.ratio,
         )
+
+    def _follow(
+        self, follow: Follow, missed: np.ndarray, expected: Array, known: np.ndarray, pixels: Array, *, gyro: bool
+    ) -> tuple[np.ndarray, Array]:
+        """Rows of the memory that no keypoint matched and that are there all the same, and where (M, 2) px.
+
+        Args:
+            follow: see :meth:`keep`.
+            missed: rows.
+            expected: (M, 2) px of them.
+            known: rows that keypoints matched.
+            pixels: (K, 2) of those.
+            gyro: whether the rotation is known.
+        """
+        places, good = follow(self._ids[missed], expected)
+        # What has come to lie where another point is has been lost.
+        crowded, _ = pairs_near(places, pixels, np.full(len(places), 0.5 * self._options.min_distance_px))
+        good = good.copy()
+        good[crowded] = False
+        missed, places = missed[good], places[good]
+        rows = np.concatenate([known, missed])
+        agree = self._agreeing(rows, np.concatenate([pixels, places]), gyro=gyro)[len(known) :]
+        return missed[agree], places[agree]
 
     def _turned(self) -> Array:
         """Rays (M, 3) of what is remembered, in the camera now, if it had only turned."""
@@ -171,9 +232,12 @@ class TrackKeeper:
             drift[unknown] = np.median(self._drift[nearest], axis=1)
         return drift
 
-    def _agreeing(self, known: np.ndarray, bearings: Array, gyro: bool) -> np.ndarray:
-        """Which matches (M,) agree with the epipolar geometry of this image and the one the point was last seen in."""
+    def _agreeing(self, known: np.ndarray, pixels: Array, *, gyro: bool) -> np.ndarray:
+        """Which points (M,) agree with the epipolar geometry of this image and the one they were last seen in."""
+        if not self._options.reject_outliers:
+            return np.ones(len(known), dtype=bool)
         agree = np.zeros(len(known), dtype=bool)
+        bearings = projection.bearings(self._camera, pixels)
         ids, absent = self._ids[known], self._absent[known]
         for images_ago in np.unique(absent):
             past = self._past[images_ago]
@@ -191,20 +255,20 @@ class TrackKeeper:
             agree |= mine & inliers
         return agree
 
-    def _choose_new(self, keypoints: Keypoints, taken: np.ndarray) -> np.ndarray:
-        """Keypoints that are given new ids."""
+    def _choose_new(self, keypoints: Keypoints, matched: np.ndarray, taken: Array) -> np.ndarray:
+        """Keypoints that are given new ids: none of those ``matched``, nor near the places ``taken`` (M, 2) px."""
         room = self._options.max_points - len(taken)
         free = np.ones(len(keypoints), dtype=bool)
-        free[taken] = False
+        free[matched] = False
         if len(taken):
             reach = np.full(len(taken), self._options.min_distance_px)
-            _, near = pairs_near(keypoints.pixels[taken], keypoints.pixels, reach)
+            _, near = pairs_near(taken, keypoints.pixels, reach)
             free[near] = False
         rows = np.flatnonzero(free)
         chosen = choose_spread(
             keypoints.pixels[rows],
             keypoints.scores[rows],
-            keypoints.pixels[taken],
+            taken,
             size_px=self._camera.size_px,
             distance=self._options.min_distance_px,
             count=room,
@@ -212,26 +276,28 @@ class TrackKeeper:
         new: np.ndarray = rows[chosen]
         return new
 
-    def _remember(
-        self, keypoints: Keypoints, bearings: Array, known: np.ndarray, found: np.ndarray, fresh: np.ndarray
-    ) -> None:
+    def _remember(self, points: Keypoints, known: np.ndarray) -> None:
+        """Take note of the points of this image: those of the rows ``known``, and then new ones."""
+        bearings = projection.bearings(self._camera, points.pixels)
+        again, fresh = slice(0, len(known)), slice(len(known), None)
         turned = self._turned()[known]
         plain, visible = projection.project(self._camera, turned)
-        moved = (keypoints.pixels[found] - plain) / (1.0 + self._absent[known])[:, None]
+        moved = (points.pixels[again] - plain) / (1.0 + self._absent[known])[:, None]
         self._drift[known] = np.where(visible[:, None], moved, np.nan)
         self._absent += 1
         self._absent[known] = 0
         self._ages[known] += 1
-        self._bearings[known] = bearings[found]
+        self._bearings[known] = bearings[again]
         if len(known):
-            self._descriptors[known] = keypoints.descriptors[found]
+            self._descriptors[known] = points.descriptors[again]
         keep = self._absent < self._options.memory_images
-        ids = np.arange(self._next_id, self._next_id + len(fresh), dtype=np.int64)
-        self._next_id += len(fresh)
-        descriptors = self._descriptors if len(self._ids) else keypoints.descriptors[:0]
+        count = len(points) - len(known)
+        ids = np.arange(self._next_id, self._next_id + count, dtype=np.int64)
+        self._next_id += count
+        descriptors = self._descriptors if len(self._ids) else points.descriptors[:0]
         self._ids = np.concatenate([self._ids[keep], ids])
-        self._ages = np.concatenate([self._ages[keep], np.ones(len(ids), dtype=np.int64)])
-        self._absent = np.concatenate([self._absent[keep], np.zeros(len(ids), dtype=np.int64)])
+        self._ages = np.concatenate([self._ages[keep], np.ones(count, dtype=np.int64)])
+        self._absent = np.concatenate([self._absent[keep], np.zeros(count, dtype=np.int64)])
         self._bearings = np.concatenate([self._bearings[keep], bearings[fresh]])
-        self._drift = np.concatenate([self._drift[keep], np.full((len(ids), 2), np.nan)])
-        self._descriptors = np.concatenate([descriptors[keep], keypoints.descriptors[fresh]])
+        self._drift = np.concatenate([self._drift[keep], np.full((count, 2), np.nan)])
+        self._descriptors = np.concatenate([descriptors[keep], points.descriptors[fresh]])

@@ -39,6 +39,14 @@ class Keypoints:
         """Only these."""
         return Keypoints(pixels=self.pixels[keep], scores=self.scores[keep], descriptors=self.descriptors[keep])
 
+    def join(self, others: "Keypoints") -> "Keypoints":
+        """These and then the others, whose descriptors are of the same kind."""
+        return Keypoints(
+            pixels=np.concatenate([self.pixels, others.pixels]),
+            scores=np.concatenate([self.scores, others.scores]),
+            descriptors=np.concatenate([self.descriptors, others.descriptors]),
+        )
+
 
 @runtime_checkable
 class Extractor(Protocol):

@@ -1,6 +1,6 @@
 """Matched points placed by how their surroundings first looked, instead of where a detector found them this time."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,10 @@ from vioframe.vision.anchors import Anchors
 _MAX_STRETCH = 1.6
 # Share of patches below which what does not fit is not the points' fault.
 _FEW_FIT = 0.5
+# Of points that are found by their patches alone.
+_FOLLOW_STEPS = 8
+_FOLLOW_REACH_PX = 3.0
+_FOLLOW_CORRELATION = 0.9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,6 +29,7 @@ class AnchorOptions:
         reach_px: largest distance of the aligned point from where the detector found it.
         min_correlation: of the patch as it first looked and what is seen now.
         memory_images: for how many images a patch is kept whose point is not seen.
+        follow: look by its patch for a point that no keypoint matched.
 
     Raises:
         ConfigError: with the key and its value.
@@ -35,6 +40,7 @@ class AnchorOptions:
     reach_px: float
     min_correlation: float
     memory_images: int
+    follow: bool
 
     def __post_init__(self) -> None:
         odd = self.window_px == 0 or (self.window_px >= 7 and self.window_px % 2 == 1)
@@ -62,6 +68,14 @@ class AnchoredPlaces:
 
     def __init__(self, options: AnchorOptions) -> None:
         self._options = options
+        # With no detector to agree a patch must fit better. It begins where the motion until now puts the point, which
+        # is further off.
+        self._alone = replace(
+            options,
+            steps=_FOLLOW_STEPS,
+            reach_px=_FOLLOW_REACH_PX,
+            min_correlation=max(_FOLLOW_CORRELATION, options.min_correlation),
+        )
         self._anchors = Anchors(options.window_px)
         self._ids: Stamps = np.zeros(0, dtype=np.int64)
         self._absent: np.ndarray = np.zeros(0, dtype=np.int64)
@@ -79,7 +93,7 @@ class AnchoredPlaces:
         keep = self._absent < self._options.memory_images
         keep[rows] = True
         if len(rows):
-            found, fits, bend = self._align(gray, pixels[seen], rows)
+            found, fits, bend = self._align(gray, pixels[seen], rows, self._options)
             self._anchors.bend[rows[fits]] = bend[fits]
             stretch = np.linalg.svd(bend, compute_uv=False)
             worn = (stretch[:, 0] > _MAX_STRETCH) | (stretch[:, 1] < 1.0 / _MAX_STRETCH)
@@ -101,6 +115,23 @@ class AnchoredPlaces:
         self._absent = np.concatenate([self._absent[keep], np.zeros(len(fresh), dtype=np.int64)])
         return placed, slipped
 
+    def follow(self, gray: Image, ids: Stamps, expected: Array) -> tuple[Array, Mask]:
+        """Look for points of images before by their patches alone; :meth:`place` is to be told of what is taken.
+
+        Args:
+            gray: (H, W) uint8, the next image.
+            ids: (M,) ascending.
+            expected: (M, 2) px where they may be.
+
+        Returns:
+            places (M, 2) px and which were found (M,); one whose patch is gone was not.
+        """
+        _, rows, mine = np.intersect1d(self._ids, ids, assume_unique=True, return_indices=True)
+        places, found = expected.copy(), np.zeros(len(ids), dtype=bool)
+        if len(rows):
+            places[mine], found[mine], _ = self._align(gray, expected[mine], rows, self._alone)
+        return places, found
+
     def place_elsewhere(self, gray: Image, ids: Stamps, pixels: Array) -> tuple[Array, Mask]:
         """The same in an image that another camera took at the instant of the last one, with nothing remembered of it.
 
@@ -110,14 +141,15 @@ class AnchoredPlaces:
             pixels: (M, 2) px where they were found.
         """
         rows = np.searchsorted(self._ids, ids)
-        placed, fits, _ = self._align(gray, pixels, rows)
+        placed, fits, _ = self._align(gray, pixels, rows, self._options)
         if len(rows) and fits.mean() < _FEW_FIT:
             return pixels, np.zeros(len(ids), dtype=bool)
         return placed, ~fits
 
-    def _align(self, gray: Image, pixels: Array, rows: np.ndarray) -> tuple[Array, Mask, np.ndarray]:
+    def _align(
+        self, gray: Image, pixels: Array, rows: np.ndarray, options: AnchorOptions
+    ) -> tuple[Array, Mask, np.ndarray]:
         """Places (K, 2), which patches fit there (K,), and their warps (K, 2, 2), of others the last."""
-        options = self._options
         found, bend, correlation = self._anchors.align(gray, pixels, self._anchors.bend[rows], options.steps, rows)
         with np.errstate(invalid="ignore"):
             near = np.linalg.norm(found - pixels, axis=-1) < options.reach_px

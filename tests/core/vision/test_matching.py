@@ -1,5 +1,7 @@
 """Matching of descriptors among possible pairs, and ids that last."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -104,23 +106,28 @@ class Scene:
         visible[list(hidden)] = False
         rows = np.flatnonzero(visible)
         keypoints = Keypoints(pixels=pixels[rows], scores=np.ones(len(rows)), descriptors=self.descriptors[rows].copy())
-        return keypoints, projection.bearings(CAMERA, keypoints.pixels), rows
+        return keypoints, rows
 
 
-def track(scene, steps, hidden=lambda k: (), gyro=True, disturb=None):
+def track(scene, steps, hidden=lambda k: (), gyro=True, disturb=None, follow=None):
+    """The point of each id, image by image; a point that was followed is that of its descriptor."""
     keeper = TrackKeeper(CAMERA, OPTIONS)
     out = []
     turn, step = so3.exp(np.array([0.01, 0.03, 0.05])), np.array([0.06, 0.02, 0.03])
     R = np.eye(3)
     for k in range(steps):
-        keypoints, bearings, rows = scene.see(R, k * step, hidden(k))
+        keypoints, rows = scene.see(R, k * step, hidden(k))
         if disturb is not None:
             keypoints = disturb(k, keypoints)
-            bearings = projection.bearings(CAMERA, keypoints.pixels)
-        ids, index, ages = keeper.keep(keypoints, bearings, turn if gyro and k else None)
-        assert len(np.unique(ids)) == len(ids) == len(index) == len(ages)
-        assert np.all(np.diff(ids) > 0)
-        out.append(dict(zip(ids.tolist(), rows[index].tolist(), strict=True)))
+        bound = None if follow is None else partial(follow, scene, R, k * step)
+        kept = keeper.keep(keypoints, turn if gyro and k else None, bound)
+        assert len(kept.ids) == len(kept.points) == len(kept.index) == len(kept.ages)
+        assert np.all(np.diff(kept.ids) > 0)
+        matched = kept.index >= 0
+        assert np.array_equal(kept.points.pixels[matched], keypoints.pixels[kept.index[matched]])
+        owners = [int(np.flatnonzero((scene.descriptors == each).all(axis=1))[0]) for each in kept.points.descriptors]
+        assert np.array_equal(rows[kept.index[matched]], np.array(owners, int)[matched])
+        out.append(dict(zip(kept.ids.tolist(), owners, strict=True)))
         R = R @ turn
     return out
 
@@ -145,6 +152,41 @@ def test_an_absent_point_comes_back_with_its_id_but_not_for_ever():
     assert sum(before[point] == after[point] for point in again) >= 0.8 * len(again)
     late = track(Scene(), 10, lambda k: away if 3 <= k < 9 else ())
     assert not {i for i, p in late[2].items() if p in away} & set(late[9])
+
+
+def true_places(scene, R, t, ids, expected):
+    """Stands in for patches: the true place nearest to where a point should be."""
+    pixels, visible = projection.project(CAMERA, (scene.points - t) @ R)
+    apart = np.linalg.norm(expected[:, None] - pixels, axis=-1)
+    nearest = apart.argmin(axis=1)
+    return pixels[nearest], (apart.min(axis=1) < 4.0) & visible[nearest]
+
+
+def test_what_no_keypoint_matches_is_followed_as_long_as_it_can_be_found():
+    away = list(range(12))
+    seen = track(Scene(), 12, lambda k: away if k >= 3 else (), follow=true_places)
+    lost = track(Scene(), 12, lambda k: away if k >= 3 else ())
+    before = {identity for identity, point in seen[2].items() if point in away}
+    assert len(before) >= 8
+    # Five images are all that an absent point is remembered for.
+    assert len(before & set(seen[9])) >= 0.6 * len(before) and not before & set(lost[9])
+    assert all(seen[k][i] == seen[2][i] for k in range(3, 12) for i in before & set(seen[k]))
+
+
+def test_what_is_followed_against_the_motion_or_onto_another_point_is_lost():
+    def off_the_line(scene, R, t, ids, expected):
+        pixels, found = true_places(scene, R, t, ids, expected)
+        return pixels + np.array([0.0, 9.0]), found
+
+    def onto_another(scene, R, t, ids, expected):
+        pixels, visible = projection.project(CAMERA, (scene.points[40:] - t) @ R)
+        return np.repeat(pixels[visible][:1] + 1.0, len(ids), axis=0), np.ones(len(ids), dtype=bool)
+
+    away = list(range(12))
+    for wrong in (off_the_line, onto_another):
+        seen = track(Scene(), 5, lambda k: away if k >= 3 else (), follow=wrong)
+        before = {identity for identity, point in seen[2].items() if point in away}
+        assert len(before & set(seen[4])) <= 1, wrong.__name__
 
 
 def test_what_contradicts_the_motion_loses_its_id():

@@ -6,7 +6,7 @@ import pytest
 
 from vioframe.vision.placing import AnchoredPlaces, AnchorOptions
 
-OPTIONS = AnchorOptions(window_px=19, steps=4, reach_px=2.0, min_correlation=0.8, memory_images=2)
+OPTIONS = AnchorOptions(window_px=19, steps=4, reach_px=2.0, min_correlation=0.8, memory_images=2, follow=True)
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +71,24 @@ def test_a_point_comes_back_and_one_long_gone_does_not(texture):
         places.place(image, np.arange(30), pixels[:30])
     placed, _ = places.place(image, np.arange(60), pixels + 0.4)
     assert np.array_equal(placed[30:], pixels[30:] + 0.4), "they begin anew where they are found"
+
+
+def test_patches_find_points_from_where_they_should_be_about(texture):
+    places, pixels, ids = AnchoredPlaces(OPTIONS), points(), np.arange(60)
+    places.place(shifted(texture, 0, 0), ids, pixels)
+    off = np.random.default_rng(3).uniform(-1.5, 1.5, pixels.shape)
+    unknown = np.array([100, 101])
+    near = pixels + np.array([2.0, -1.0]) + off
+    expected = np.concatenate([near, [(50.0, 50.0), (300.0, 200.0)]])
+    found, good = places.follow(shifted(texture, 2, -1, 0.6), np.concatenate([ids, unknown]), expected)
+    assert good[:60].mean() > 0.95 and not good[60:].any()
+    assert np.linalg.norm(found - expected, axis=1)[60:].max() == 0.0
+    assert np.linalg.norm(found[:60] - pixels - (2.0, -1.0), axis=1)[good[:60]].max() < 0.1
+    _, elsewhere = places.follow(shifted(texture, 200, 100), ids, pixels)
+    assert elsewhere.mean() < 0.1
+    for level in (0, 128, 255):
+        _, nowhere = places.follow(np.full((480, 640), level, np.uint8), ids, pixels)
+        assert not nowhere.any()
 
 
 def test_the_other_camera_is_placed_by_the_same_patches(texture):
