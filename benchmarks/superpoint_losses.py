@@ -29,7 +29,7 @@ LOSSES: dict[str, DescriptorLoss] = {
     "sparse_hinge": SparseHingeLoss(
         weight=1.0, positive_margin=1.0, negative_margin=0.2, positive_weight=1.0, negatives=100, radius_px=8.0
     ),
-    "sparse_triplet": SparseTripletLoss(weight=1.2, margin=1.0, negatives=4, radius_px=8.0, both_ways=True),
+    "sparse_triplet": SparseTripletLoss(weight=1.2, margin=1.0, negatives=16, radius_px=8.0, both_ways=True),
 }
 
 

@@ -1,5 +1,6 @@
 """How good the net is while it learns: pairs of views of pictures it does not learn from, and two drawings of them."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from vioframe_superpoint.training.adaptation import refined
 from vioframe_superpoint.training.options import ShapesOptions
 from vioframe_superpoint.training.steps import as_float
 
+log = logging.getLogger(__name__)
+
 _POINTS = 300
 _RADIUS_PX = 4
 _CORRECT_PX = 3.0
@@ -27,6 +30,10 @@ _CORRECT_PX = 3.0
 # never looked at.
 _VIEWS = HomographyOptions(patch_ratio=0.8, perspective=0.2, scale=0.2, max_angle=0.5, overflow=0.0)
 _VALIDATION = 5
+# Mean cosine between descriptors of different points that leaves next to nothing to tell them apart by, and on how many
+# pictures it is looked at.
+_ALIKE = 0.9
+_PICTURES = 4
 _SHAPES_SEED = 7919
 _SHAPES = 64
 
@@ -105,7 +112,10 @@ class PairValidation:
         )
 
     def figures(self) -> dict[str, float]:
-        """Means over the pairs, by name; ``rank`` is that of repeatability and homography accuracy over both splits."""
+        """Means over the pairs, by name; ``rank`` is that of repeatability and homography accuracy over both splits.
+
+        Warns where descriptors have become alike, which leaves homographies of easy pairs right for a long time.
+        """
         extractor = NetExtractor(self._net)
         seen = [score_pair("superpoint", extractor, pair, self._protocol).scores for pair in self._pairs]
         figures: dict[str, float] = {}
@@ -114,13 +124,28 @@ class PairValidation:
                 f"{split}/{name}": value for name, value in _means([s for s in seen if s.split == split]).items()
             }
         whole = _means(seen)
+        alike = float(np.mean([self._alike(extractor, pair.first) for pair in self._pairs[: 2 * _PICTURES : 2]]))
+        if alike > _ALIKE:
+            log.warning(
+                "descriptors of different points have a mean cosine of %.2f: they have become alike, as those do whose "
+                "loss asks too much of them; raise negatives or radius_px of descriptor_loss=sparse_triplet, lower "
+                "frontend.training.learning_rate, or choose descriptor_loss=sparse_hinge",
+                alike,
+            )
         return {
             "rank": 0.5 * (whole["repeatability"] + whole["homography_accuracy"]),
             "rep": whole["repeatability"],
             "hom": whole["homography_accuracy"],
             "match": whole["matching_score"],
+            "alike": alike,
             **figures,
         }
+
+    def _alike(self, extractor: NetExtractor, picture: Image) -> float:
+        """Mean cosine between descriptors of different points of a picture."""
+        found = extractor.extract(picture, np.full(picture.shape, 255, np.uint8)).descriptors
+        count = max(len(found), 2)
+        return float((np.sum(found, axis=0) ** 2).sum() - len(found)) / (count * (count - 1))
 
     def draw(self, path: Path) -> None:
         """A picture of points and matches: the first pair of either split."""

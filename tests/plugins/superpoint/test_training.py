@@ -62,7 +62,7 @@ OPTIONS = TrainingOptions(
     workers=0,
     labels=None,
     detector=None,
-    descriptor_loss=SparseTripletLoss(weight=1.2, margin=1.0, negatives=4, radius_px=8.0, both_ways=True),
+    descriptor_loss=SparseTripletLoss(weight=1.2, margin=1.0, negatives=16, radius_px=8.0, both_ways=True),
     pictures=PictureOptions(count=4, size_px=[96, 64], folder=None, places=0.0, held_out=2),
     shapes=ShapesOptions(iterations=4, batch_size=2, size_px=[64, 48], learning_rate=1e-3, corner_weight=8.0),
     adaptation=AdaptationOptions(
