@@ -112,7 +112,7 @@ class PairValidation:
         )
 
     def figures(self) -> dict[str, float]:
-        """Means over the pairs, by name; ``rank`` is that of repeatability and homography accuracy over both splits.
+        """Means over the pairs, by name; ``rank`` is that of repeatability and NN mAP over both splits.
 
         Warns where descriptors have become alike, which leaves homographies of easy pairs right for a long time.
         """
@@ -133,7 +133,7 @@ class PairValidation:
                 alike,
             )
         return {
-            "rank": 0.5 * (whole["repeatability"] + whole["homography_accuracy"]),
+            "rank": 0.5 * (whole["repeatability"] + whole["mean_average_precision"]),
             "rep": whole["repeatability"],
             "hom": whole["homography_accuracy"],
             "match": whole["matching_score"],

@@ -35,6 +35,8 @@ def test_descriptors_that_have_become_alike_are_told(pictures, caplog):
     with caplog.at_level(logging.WARNING):
         apart = validation.figures()
     assert apart["alike"] < 0.8 and not caplog.text
+    precision = np.mean([apart[f"{split}/mean_average_precision"] for split in ("illumination", "viewpoint")])
+    assert apart["rank"] == pytest.approx(0.5 * (apart["rep"] + precision)), "as many pairs of either"
     with torch.no_grad():
         net.descriptor.centre.bias[0] = 100.0
     with caplog.at_level(logging.WARNING):
